@@ -1,0 +1,1 @@
+"""What cannot be jitted: files, meshes, rendering, weights, data sets."""

@@ -1,0 +1,96 @@
+"""The records that flow through ipjax, in the order in which they arise.
+
+Every record is an Equinox module: a pytree of arrays, so it can be jitted, vmapped and donated. ``*b`` stands for
+whatever was vmapped over. Frames: ``object`` is the normalised mesh (bounding-box centre at the origin, diameter 1),
+``camera`` has OpenCV axes (x right, y down, z ahead) and metres.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Camera(eqx.Module):
+    """A pinhole camera without distortion; the centre of the first pixel is at (0, 0), as in OpenCV and BOP."""
+
+    focal: Float[Array, "*b 2"]  # pixels, (x, y)
+    centre: Float[Array, "*b 2"]  # pixels, (x, y)
+
+
+class Similarity(eqx.Module):
+    """``x_a = scale * rotation @ x_b + translation``; name it ``a_from_b``."""
+
+    rotation: Float[Array, "*b 3 3"]
+    translation: Float[Array, "*b 3"]  # units of a
+    scale: Float[Array, "*b"]  # units of a per unit of b
+
+    def __matmul__(self, points: Float[Array, "*b n 3"]) -> Float[Array, "*b n 3"]:
+        """Map points of frame b to frame a; rows are points."""
+        # Sums of products, not a matrix product: exact in float32 on every backend, and faster for three columns.
+        moved = jnp.sum(self.rotation[..., None, :, :] * points[..., :, None, :], axis=-1)
+        return self.scale[..., None, None] * moved + self.translation[..., None, :]
+
+
+class View(eqx.Module):
+    """One RGB-D image: a rendered template or a crop of the scene."""
+
+    rgb: Float[Array, "*b h w 3"]  # [0, 1]
+    depth: Float[Array, "*b h w"]  # along z; metres (query) or model units (template); 0 = unknown
+    mask: Bool[Array, "*b h w"]  # the object
+    camera: Camera
+
+
+class Patches(eqx.Module):
+    """What the encoder made of a view: a feature and a 3-D point for each patch."""
+
+    features: Float[Array, "*b p c"]  # unit norm
+    points: Float[Array, "*b p 3"]  # in the owner's frame: object (model units) or camera (metres)
+    grid: Float[Array, "*b p 2"]  # (column, row), in patches
+    valid: Bool[Array, "*b p"]  # on the object, with a depth
+
+
+class Surface(eqx.Module):
+    """Points sampled evenly on the object's surface."""
+
+    points: Float[Array, "*b n 3"]  # model units
+    normals: Float[Array, "*b n 3"]  # unit, outwards
+    seen: Float[Array, "*b n"]  # 1 = measured or observed, 0 = guessed by the reconstruction
+
+
+class Templates(eqx.Module):
+    """The object, ready to be found: rendered views as patches, their poses, and its surface.
+
+    Points are in the normalised object frame, so one model unit is one diameter and the scale of an estimated
+    ``camera_from_object`` is the object's diameter in metres.
+    """
+
+    patches: Patches  # leading axes *b v
+    seen: Float[Array, "*b v p"]  # how much of the patch's surface was seen (1) or guessed (0)
+    camera_from_object: Similarity  # leading axes *b v; scale 1, model units
+    camera: Camera  # of the templates, leading axes *b; pixels of the rendered image
+    surface: Surface
+    extents: Float[Array, "*b 3"]  # sides of the axis-aligned bounding box, model units
+
+
+class Query(eqx.Module):
+    """The crop of the scene, ready to be matched."""
+
+    patches: Patches
+    view: View  # the crop itself: its depth and mask serve refinement and scoring
+
+
+class Matches(eqx.Module):
+    """Patch correspondences between the query and every template, best first."""
+
+    query: Int[Array, "*b v k"]  # patch index
+    template: Int[Array, "*b v k"]
+    distance: Float[Array, "*b v k"]  # cyclic distance in patches (Eq. 4); inf = no match
+    similarity: Float[Array, "*b v k"]  # cosine
+
+
+class Pairs(eqx.Module):
+    """3-D to 3-D correspondences."""
+
+    object: Float[Array, "*b k 3"]  # model units
+    camera: Float[Array, "*b k 3"]  # metres
+    weight: Float[Array, "*b k"]  # [0, 1]; 0 = absent

@@ -1,0 +1,40 @@
+"""Tests are stricter than users: shapes are checked at run time, warnings are errors, promotion is strict."""
+
+import os
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+install_import_hook(["ipjax", "ipjax_kernels"], "beartype.beartype")
+
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
+
+_CACHE = Path(__file__).resolve().parent.parent / "build" / "xla-cache"
+jax.config.update("jax_compilation_cache_dir", str(_CACHE))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+hypothesis.settings.register_profile("ci", max_examples=30, deadline=None, derandomize=True, database=None)
+hypothesis.settings.register_profile("thorough", max_examples=300, deadline=None)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+GOLDEN = Path(__file__).resolve().parent / "golden"
+
+
+@pytest.fixture
+def shared() -> Path:
+    """The folder of data that is not in the repository; tests that need it skip, and say so."""
+    if not SHARED.is_dir():
+        pytest.skip(f"no shared data at {SHARED}")
+    return SHARED
+
+
+@pytest.fixture
+def x64():
+    """Run a test in float64; the library itself never sets it."""
+    with jax.enable_x64(True):
+        yield
