@@ -147,7 +147,7 @@ def frame_turned(
         mask = inside
         if not mask.any():
             raise ValueError("the mask is empty inside the box")
-    mask, bounds = _without_specks(mask)
+    mask, bounds = _without_specks(np.ascontiguousarray(mask))
 
     median = _check_unit(depth, mask, bounds, scale)
     cut = _cut_square if crop == "square" else _cut_look_at
@@ -309,7 +309,7 @@ def _without_specks(mask: np.ndarray) -> tuple[np.ndarray, tuple[int, int, int, 
     keep = np.zeros(count, bool)
     keep[1:] = areas >= 0.02 * areas.max()
     if not keep[1:].all():
-        mask = keep[labels]
+        mask = keep[np.asarray(labels)]
     boxes = stats[keep]
     left, top = boxes[:, cv2.CC_STAT_LEFT].min(), boxes[:, cv2.CC_STAT_TOP].min()
     right = (boxes[:, cv2.CC_STAT_LEFT] + boxes[:, cv2.CC_STAT_WIDTH]).max()

@@ -1,0 +1,436 @@
+"""The object file: an onboarded object as one portable safetensors file.
+
+Layout: one safetensors file (https://github.com/huggingface/safetensors). Its metadata holds one JSON text under the
+key ``ipjax``: format version, who the object and the encoder are, how the normalised object frame lies in the user's
+mesh, and a checksum. Tensors, for v templates of p patches with c channels:
+
+    features f16 [v p c] · points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
+    rotation f32 [v 3 3] · translation f32 [v 3] · focal, centre f32 [v 2]           camera_from_object and its camera
+    surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3]
+    mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
+    pictures u8 [bytes] · pictures.end i64 [v]                                       optional, one JPEG per template
+
+Lengths are model units: the object's bounding box is centred at the origin and its diameter is 1.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ipjax.types import Camera, Patches, Similarity, Surface, Templates
+
+FORMAT = 1
+SUFFIX = ".ipjax"
+_PICTURE = 160  # pixels, longest side of a stored template image
+
+_TEMPLATE_TENSORS = {
+    "features": ("float16", "vpc"),
+    "points": ("float32", "vp3"),
+    "grid": ("float32", "vp2"),
+    "valid": ("bool", "vp"),
+    "seen": ("float32", "vp"),
+    "rotation": ("float32", "v33"),
+    "translation": ("float32", "v3"),
+    "focal": ("float32", "v2"),
+    "centre": ("float32", "v2"),
+    "surface.points": ("float32", "n3"),
+    "surface.normals": ("float32", "n3"),
+    "surface.seen": ("float32", "n"),
+    "extents": ("float32", "3"),
+}
+_OPTIONAL_TENSORS = {
+    "mesh.vertices": ("float32", "a3"),
+    "mesh.faces": ("int32", "b3"),
+    "mesh.colours": ("uint8", "a3"),
+    "pictures": ("uint8", "j"),
+    "pictures.end": ("int64", "v"),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjectInfo:
+    """What is known about an onboarded object besides its templates.
+
+    Args:
+        name: of the object.
+        encoder: `Encoder.identity` of the encoder that described the templates.
+        mesh_scale: model units per unit of the mesh file (1 / the diameter there).
+        mesh_centre: the object frame's origin in the mesh file's frame, in its units.
+        mesh_file: name of the mesh file, without folders.
+        mesh_sha256: of the mesh file.
+        metres_per_unit: of the mesh file, where the user said so; None = unknown.
+        config: how it was onboarded, as JSON can say it.
+        notes: what the readers and repairers had to say.
+        resolution: side of the template images in pixels.
+        vertices, faces, colours: the normalised mesh, for pictures; None = not kept.
+        pictures: the template images ``[v h w 3]`` uint8, or the JPEG bytes of each; None = not kept.
+    """
+
+    name: str
+    encoder: str
+    mesh_scale: float = 1.0
+    mesh_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mesh_file: str = ""
+    mesh_sha256: str = ""
+    metres_per_unit: float | None = None
+    config: dict[str, Any] = dataclasses.field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    resolution: int = 224
+    vertices: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    colours: np.ndarray | None = None
+    pictures: Any = None
+
+    @property
+    def object_from_mesh(self) -> Similarity:
+        """Model units from the coordinates of the user's mesh file."""
+        scale = jnp.asarray(self.mesh_scale, jnp.float32)
+        return Similarity(
+            rotation=jnp.eye(3, dtype=jnp.float32),
+            translation=jnp.asarray(-self.mesh_scale * np.asarray(self.mesh_centre, np.float64), jnp.float32),
+            scale=scale,
+        )
+
+    def picture(self, view: int) -> np.ndarray | None:
+        """The image of one template, uint8 ``[h w 3]``; None where none was kept."""
+        if self.pictures is None:
+            return None
+        if isinstance(self.pictures, np.ndarray):
+            return self.pictures[view]
+        import cv2
+
+        image = cv2.imdecode(np.frombuffer(self.pictures[view], np.uint8), cv2.IMREAD_COLOR)
+        return None if image is None else np.ascontiguousarray(image[..., ::-1])
+
+
+def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
+    """Write an object file; the file appears whole or not at all.
+
+    Args:
+        path: usually ending in ``.ipjax``; an existing file is replaced.
+        templates: of one object, not batched. Features are stored as float16.
+
+    Raises:
+        ValueError: the templates are no single object's, or hold numbers that are not finite.
+        OSError: the file cannot be written.
+    """
+    from safetensors.numpy import save_file
+
+    path = Path(path)
+    patches, pose = templates.patches, templates.camera_from_object
+    tensors: dict[str, Any] = {
+        "features": patches.features,
+        "points": patches.points,
+        "grid": patches.grid,
+        "valid": patches.valid,
+        "seen": templates.seen,
+        "rotation": pose.rotation,
+        "translation": pose.translation,
+        "focal": templates.camera.focal,
+        "centre": templates.camera.centre,
+        "surface.points": templates.surface.points,
+        "surface.normals": templates.surface.normals,
+        "surface.seen": templates.surface.seen,
+        "extents": templates.extents,
+    }
+    if np.ndim(patches.features) != 3:
+        raise ValueError(
+            f"templates of one object have features [views, patches, channels], not {patches.features.shape}"
+        )
+    if not np.allclose(pose.scale, 1):
+        raise ValueError("the poses of templates must have scale 1")
+    if info.vertices is not None and info.faces is not None:
+        vertices, faces, colours = _simplify(info.vertices, info.faces, info.colours)
+        tensors |= {"mesh.vertices": vertices, "mesh.faces": faces}
+        if colours is not None:
+            tensors["mesh.colours"] = colours
+    if info.pictures is not None:
+        pictures = _compress(info.pictures)
+        tensors["pictures"] = np.frombuffer(b"".join(pictures), np.uint8)
+        tensors["pictures.end"] = np.cumsum([len(picture) for picture in pictures])
+    kinds = _TEMPLATE_TENSORS | _OPTIONAL_TENSORS
+    tensors = {name: np.ascontiguousarray(np.asarray(array), kinds[name][0]) for name, array in tensors.items()}
+    _check_shapes({name: (array.dtype.name, array.shape) for name, array in tensors.items()}, str(path))
+    for name, array in tensors.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name} has values that are not finite")
+    header = {
+        "format": FORMAT,
+        "writer": f"ipjax {_version()}",
+        "name": info.name,
+        "encoder": info.encoder,
+        "mesh": {
+            "file": info.mesh_file,
+            "sha256": info.mesh_sha256,
+            "scale": float(info.mesh_scale),
+            "centre": [float(x) for x in info.mesh_centre],
+            "metres_per_unit": info.metres_per_unit,
+        },
+        "config": info.config,
+        "notes": list(info.notes),
+        "resolution": int(info.resolution),
+    }
+    header = json.loads(json.dumps(header, allow_nan=False))
+    text = json.dumps(header | {"content_sha256": _hash(header, tensors)})
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    os.close(handle)
+    try:
+        save_file(tensors, temporary, metadata={"ipjax": text})
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)  # mkstemp makes files that only their owner can read
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return path
+
+
+def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
+    """Read an object file.
+
+    Args:
+        encoder: the encoder that will describe queries; anything with an ``identity``. None = do not compare.
+
+    Raises:
+        ValueError: missing, damaged, of another version, or made by another encoder; one sentence that names the file.
+    """
+    header, tensors = _read(Path(path))
+    info = _info(header, tensors, Path(path))
+    if encoder is not None and encoder.identity != info.encoder:
+        raise ValueError(
+            f"{path}: made with the encoder '{info.encoder}', but the one at hand is '{encoder.identity}'; "
+            "onboard the object again, or give the weights it was made with"
+        )
+    device = {name: jnp.asarray(tensors[name]) for name in _TEMPLATE_TENSORS}
+    views = len(tensors["rotation"])
+    return (
+        Templates(
+            patches=Patches(
+                features=device["features"], points=device["points"], grid=device["grid"], valid=device["valid"]
+            ),
+            seen=device["seen"],
+            camera_from_object=Similarity(
+                rotation=device["rotation"],
+                translation=device["translation"],
+                scale=jnp.ones(views, jnp.float32),
+            ),
+            camera=Camera(focal=device["focal"], centre=device["centre"]),
+            surface=Surface(
+                points=device["surface.points"], normals=device["surface.normals"], seen=device["surface.seen"]
+            ),
+            extents=device["extents"],
+        ),
+        info,
+    )
+
+
+def check(path: str | Path) -> list[str]:
+    """Read an object file to its last byte and say what it holds.
+
+    Returns:
+        Sentences for a person: the object, its size, who made it, what was noted.
+
+    Raises:
+        ValueError: as `load`, or the content is not what was written, or cannot be true.
+    """
+    path = Path(path)
+    header, tensors = _read(path)
+    info = _info(header, tensors, path)
+    if _hash(header, tensors) != header.get("content_sha256"):
+        raise ValueError(f"{path}: damaged: the content does not have the checksum in its header")
+    for name, array in tensors.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{path}: damaged: {name} has values that are not finite")
+    rotation = tensors["rotation"].astype(np.float64)
+    if np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation).min() < 0:
+        raise ValueError(f"{path}: damaged: the template poses hold something that is no rotation")
+    length = np.linalg.norm(tensors["features"].astype(np.float32), axis=-1)[tensors["valid"]]
+    if length.size == 0:
+        raise ValueError(f"{path}: no template shows any patch of the object")
+    if np.abs(length - 1).max() > 1e-2:
+        raise ValueError(f"{path}: damaged: features of valid patches are not unit vectors")
+    views, patches, channels = tensors["features"].shape
+    seen = tensors["valid"].sum(axis=1).mean()
+    size = 1 / info.mesh_scale
+    unit = f" ({size * info.metres_per_unit * 1e3:.1f} mm)" if info.metres_per_unit else ", unit unknown"
+    return [
+        f"object {info.name!r} from {info.mesh_file or 'a mesh'} (sha256 {info.mesh_sha256[:12] or 'unknown'})",
+        f"diameter {size:g} in the mesh's unit{unit}",
+        f"{views} templates of {patches} patches with {channels} channels; {seen:.0f} valid each",
+        f"encoder {info.encoder}",
+        f"written by {header.get('writer', 'an unknown writer')}, format {header['format']}, content as written",
+        *info.notes,
+    ]
+
+
+def _version() -> str:
+    import ipjax
+
+    return ipjax.__version__
+
+
+def _hash(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        array = tensors[name]
+        digest.update(f"{name} {array.dtype.name} {array.shape}\n".encode())
+        digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    digest.update(json.dumps({k: v for k, v in header.items() if k != "content_sha256"}, sort_keys=True).encode())
+    return digest.hexdigest()
+
+
+def _check_shapes(found: dict[str, tuple[str, tuple[int, ...]]], where: str) -> None:
+    """Names, types and shapes fit one another; letters stand for one length each."""
+    missing = sorted(_TEMPLATE_TENSORS.keys() - found.keys())
+    unknown = sorted(found.keys() - _TEMPLATE_TENSORS.keys() - _OPTIONAL_TENSORS.keys())
+    if missing or unknown:
+        what = f"{missing[0]} is missing" if missing else f"{unknown[0]!r} is unknown"
+        raise ValueError(f"{where}: not an object file: {what}")
+    lengths: dict[str, int] = {}
+    for name, (dtype, shape) in found.items():
+        kind, letters = (_TEMPLATE_TENSORS | _OPTIONAL_TENSORS)[name]
+        fits = dtype == kind and len(shape) == len(letters)
+        if fits:
+            for letter, length in zip(letters, shape, strict=True):
+                expected = int(letter) if letter.isdigit() else lengths.setdefault(letter, length)
+                fits = fits and length == expected and (length > 0 or letter in "abj")
+        if not fits:
+            raise ValueError(f"{where}: not a usable object: {name} is {dtype} {list(shape)}")
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise ValueError(f"{path}: no such object file")
+    types = {"F16": "float16", "F32": "float32", "BOOL": "bool", "U8": "uint8", "I32": "int32", "I64": "int64"}
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if "ipjax" not in metadata:
+                raise ValueError(f"{path}: a safetensors file, but not an object file; make one with 'ipjax onboard'")
+            header = _parse_header(metadata["ipjax"], path)
+            slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+            _check_shapes(
+                {
+                    name: (types.get(str(s.get_dtype()), str(s.get_dtype())), tuple(s.get_shape()))
+                    for name, s in slices.items()
+                },
+                str(path),
+            )
+            tensors = {name: file.get_tensor(name) for name in slices}
+    except SafetensorError as error:
+        raise ValueError(f"{path}: not an object file, or a damaged one ({str(error).splitlines()[0]})") from None
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
+    for name in ("rotation", "translation", "focal", "centre", "extents", "surface.points"):
+        if not np.isfinite(tensors[name]).all():
+            raise ValueError(f"{path}: damaged: {name} has values that are not finite")
+    return header, tensors
+
+
+def _parse_header(text: str, path: Path) -> dict[str, Any]:
+    try:
+        header = json.loads(text)
+    except (json.JSONDecodeError, RecursionError):
+        raise ValueError(f"{path}: damaged: its description is not JSON") from None
+    version = header.get("format") if isinstance(header, dict) else None
+    if not isinstance(version, int):
+        raise ValueError(f"{path}: damaged: its description has no format version")
+    if version != FORMAT:
+        advice = "a newer ipjax wrote it; upgrade ipjax" if version > FORMAT else "onboard the object again"
+        raise ValueError(f"{path}: object file of format {version}, but this ipjax reads format {FORMAT}: {advice}")
+    return header
+
+
+def _info(header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path) -> ObjectInfo:
+    try:
+        mesh = header["mesh"]
+        scale, centre = float(mesh["scale"]), [float(x) for x in mesh["centre"]]
+        if not (np.isfinite(scale) and scale > 0 and len(centre) == 3 and np.isfinite(centre).all()):
+            raise ValueError("scale")
+        unit = mesh.get("metres_per_unit")
+        info = ObjectInfo(
+            name=str(header["name"]),
+            encoder=str(header["encoder"]),
+            mesh_scale=scale,
+            mesh_centre=(centre[0], centre[1], centre[2]),
+            mesh_file=str(mesh.get("file", "")),
+            mesh_sha256=str(mesh.get("sha256", "")),
+            metres_per_unit=None if unit is None else float(unit),
+            config=dict(header.get("config", {})),
+            notes=tuple(str(note) for note in header.get("notes", ())),
+            resolution=int(header["resolution"]),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError):
+        raise ValueError(f"{path}: damaged: its description lacks the mesh, the encoder or the name") from None
+    vertices, faces = tensors.get("mesh.vertices"), tensors.get("mesh.faces")
+    if vertices is None or faces is None or len(vertices) == 0:
+        vertices = faces = None
+    elif faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ValueError(f"{path}: damaged: faces of the mesh refer to vertices that do not exist")
+    pictures = None
+    if "pictures" in tensors and "pictures.end" in tensors:
+        blob, end = tensors["pictures"], tensors["pictures.end"]
+        if end[0] < 0 or (np.diff(end) < 0).any() or end[-1] != len(blob):
+            raise ValueError(f"{path}: damaged: the template pictures do not end where they should")
+        start = np.concatenate([[0], end[:-1]])
+        pictures = [blob[a:b].tobytes() for a, b in zip(start, end, strict=True)]
+    return dataclasses.replace(
+        info,
+        vertices=vertices,
+        faces=faces,
+        colours=None if vertices is None else tensors.get("mesh.colours"),
+        pictures=pictures,
+    )
+
+
+def _compress(pictures: Any) -> list[bytes]:
+    if not isinstance(pictures, np.ndarray):
+        return [bytes(picture) for picture in pictures]
+    import cv2
+
+    if pictures.ndim != 4 or pictures.shape[-1] != 3 or pictures.dtype != np.uint8:
+        raise ValueError(
+            f"pictures must be uint8 [views, height, width, 3], not {pictures.dtype} {list(pictures.shape)}"
+        )
+    compressed = []
+    for picture in pictures:
+        zoom = _PICTURE / max(picture.shape[:2])
+        if zoom < 1:
+            picture = cv2.resize(picture, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
+        _, code = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 90])
+        compressed.append(code.tobytes())
+    return compressed
+
+
+def _simplify(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, most: int = 60_000):
+    """A mesh good enough for outlines: vertices in one cell of a grid become one, until few enough faces remain."""
+    vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int64)
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ValueError("faces of the mesh refer to vertices that do not exist")
+    if colours is not None and len(colours) != len(vertices):
+        raise ValueError(f"the mesh has {len(vertices)} vertices but {len(colours)} colours")
+    cells = 192.0
+    original = (vertices, faces, colours)
+    while len(faces) > most and cells >= 24:
+        vertices, faces, colours = original
+        key = np.floor(vertices * cells).astype(np.int64)
+        _, first, index = np.unique(key, axis=0, return_index=True, return_inverse=True)
+        index = index.reshape(-1)
+        count = np.bincount(index).astype(np.float32)
+        vertices = np.stack([np.bincount(index, weights=vertices[:, k]) / count for k in range(3)], axis=-1)
+        colours = None if colours is None else np.asarray(colours)[first]
+        faces = index[faces]
+        real = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        faces = np.unique(faces[real], axis=0)
+        cells *= 0.75
+    return vertices.astype(np.float32), faces.astype(np.int32), colours
