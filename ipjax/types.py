@@ -67,7 +67,7 @@ class Templates(eqx.Module):
     patches: Patches  # leading axes *b v
     seen: Float[Array, "*b v p"]  # how much of the patch's surface was seen (1) or guessed (0)
     camera_from_object: Similarity  # leading axes *b v; scale 1, model units
-    camera: Camera  # of the templates, leading axes *b; pixels of the rendered image
+    camera: Camera  # of each template, leading axes *b v; pixels of the rendered image
     surface: Surface
     extents: Float[Array, "*b 3"]  # sides of the axis-aligned bounding box, model units
 
@@ -80,8 +80,10 @@ class Query(eqx.Module):
 
 
 class Matches(eqx.Module):
-    """Patch correspondences between the query and every template, best first."""
+    """Patch correspondences between the query and its best templates; templates and pairs both best first."""
 
+    ranking: Float[Array, "*b m"]  # of all templates; higher is better
+    view: Int[Array, "*b v"]  # the templates kept
     query: Int[Array, "*b v k"]  # patch index
     template: Int[Array, "*b v k"]
     distance: Float[Array, "*b v k"]  # cyclic distance in patches (Eq. 4); inf = no match
@@ -94,3 +96,23 @@ class Pairs(eqx.Module):
     object: Float[Array, "*b k 3"]  # model units
     camera: Float[Array, "*b k 3"]  # metres
     weight: Float[Array, "*b k"]  # [0, 1]; 0 = absent
+
+
+class Hypotheses(eqx.Module):
+    """Candidate poses, best first."""
+
+    camera_from_object: Similarity  # leading axes *b h
+    score: Float[Array, "*b h"]  # higher is better; [0, 1]
+
+
+class PoseEstimate(eqx.Module):
+    """The answer, and what it rests on."""
+
+    camera_from_object: Similarity  # metres from model units; the scale is the object's diameter in metres
+    confidence: Float[Array, "*b"]  # [0, 1]
+    hypotheses: Hypotheses  # the alternatives, the answer first
+    view: Int[Array, "*b"]  # the template whose pairs led to the answer
+    view_score: Float[Array, "*b v"]  # of every template; higher is better
+    inliers: Int[Array, "*b"]  # pairs of that view within the threshold
+    rmse: Float[Array, "*b"]  # of those pairs, metres
+    success: Bool[Array, "*b"]  # a pose was found at all: enough pairs, not degenerate

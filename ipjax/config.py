@@ -1,0 +1,100 @@
+"""Every default once, with its unit and where it comes from.
+
+A field marked ``static`` fixes a shape or picks a code path; changing it compiles again. All others are traced and can
+be swept without a second trace. ``Config()`` is the best known so far, ``Config.paper()`` the paper's method.
+"""
+
+from typing import Literal
+
+import equinox as eqx
+
+
+def _static(default):
+    return eqx.field(static=True, default=default)
+
+
+class DescribeConfig(eqx.Module):
+    """From a view to its patches."""
+
+    cover: float = 0.3  # least share of a patch that must be object with a depth
+    spread: float = 0.05  # depths farther than this share of their patch's median belong to something else
+
+
+class MatchConfig(eqx.Module):
+    """From patches to pairs (Eq. 1–5)."""
+
+    ranking: Literal["cyclic", "cosine"] = _static("cosine")  # views by Eq. 5, or by the cosines of short cycles
+    views: int = _static(8)  # templates whose pairs are kept
+    pairs: int = _static(256)  # most pairs of each (the paper's K)
+    cycle: float = 1.5  # longest cycle of a pair, patches; inf in the paper
+    memory_bytes: int = _static(64 * 2**20)  # bound on the similarities held at once
+
+
+class AlignConfig(eqx.Module):
+    """From pairs to similarities (Algorithm 1, corrected)."""
+
+    count: int = _static(1024)  # minimal sets per view
+    size: int = _static(3)  # pairs in one
+    rank: Literal["msac", "count"] = _static("msac")
+    keep: int = _static(2)  # hypotheses kept per view
+    refits: int = _static(3)
+    threshold: float = 0.08  # residual of an inlier, in diameters: about one patch
+    scale_gate: tuple[float, float] = (0.5, 2.0)  # around the size seen in the mask and depth
+    edge_ratio: float = 0.5  # least ratio of a sample's edge lengths after the scale prior
+
+
+class RefineConfig(eqx.Module):
+    """From a coarse similarity to one that fits the depth image."""
+
+    steps: int = _static(12)  # 0 = none, as in the paper
+    points: int = _static(384)  # surface points per direction of the association
+    reach: float = 0.06  # associations farther than this are dropped, in diameters
+    width: float = 0.01  # of the robust loss, in diameters
+
+
+class ScoreConfig(eqx.Module):
+    """Which hypothesis explains the query best."""
+
+    ranking: Literal["inliers", "render"] = _static("render")
+    resolution: int = _static(56)  # pixels on a side of the depth comparison
+    tolerance: float = 0.03  # depth difference that still agrees, in diameters
+
+
+class Config(eqx.Module):
+    """The settings of :func:`ipjax.estimate`."""
+
+    match: MatchConfig = MatchConfig()
+    align: AlignConfig = AlignConfig()
+    refine: RefineConfig = RefineConfig()
+    score: ScoreConfig = ScoreConfig()
+
+    @staticmethod
+    def paper() -> "Config":
+        """The paper's choices, its misprints corrected: K = 50, Eq. 5, one view, four-point samples, no gate."""
+        return Config(
+            match=MatchConfig(ranking="cyclic", views=1, pairs=50, cycle=float("inf")),
+            align=AlignConfig(
+                count=1000,
+                size=4,
+                rank="count",
+                keep=1,
+                refits=1,
+                threshold=0.08,
+                scale_gate=(0.0, float("inf")),
+                edge_ratio=0.0,
+            ),
+            refine=RefineConfig(steps=0),
+            score=ScoreConfig(ranking="inliers"),
+        )
+
+
+class OnboardConfig(eqx.Module):
+    """From a mesh to templates."""
+
+    directions: int = _static(40)  # viewpoints on the Fibonacci sphere
+    rolls: int = _static(10)  # in-plane rotations of each; 40 × 10 is the paper's 400
+    resolution: int = _static(224)  # pixels on a side
+    fill: float = _static(0.83)  # share of the image that the object's box takes: 20 % of padding around it
+    distance: float = _static(3.0)  # diameters from the camera to the object's centre
+    surface: int = _static(2048)  # points sampled on the surface
+    describe: DescribeConfig = DescribeConfig()

@@ -1,0 +1,85 @@
+"""Which template looks like the query, and which patch is which (Eq. 1–5)."""
+
+import jax
+import jax.numpy as jnp
+from ipjax_kernels.neighbours import cycle_distance, nearest
+from jax import lax
+from jaxtyping import Array, Float
+
+from ipjax.config import MatchConfig
+from ipjax.types import Matches, Pairs, Patches, Templates
+
+
+def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfig()) -> Matches:  # noqa: B008
+    """Nearest neighbours both ways, cyclic distances, and the templates ranked by them.
+
+    The cycle starts at the query (Eq. 2–4); masks enter before every argmax. ``ranking='cyclic'`` is Eq. 5, the sum
+    of the K smallest distances, with ties (the rule, not the exception, on a patch grid) broken by the sum of their
+    cosines. ``ranking='cosine'`` sums the cosines of all cycles no longer than ``config.cycle``.
+
+    Args:
+      query: patches ``p`` of the crop.
+      templates: patches ``v q`` of the object.
+
+    Returns:
+      ``config.views`` templates with ``config.pairs`` pairs each, ordered by distance, then cosine, then patch.
+
+    Raises:
+      ValueError: the features of the two sides differ in length.
+    """
+    if query.features.shape[-1] != templates.patches.features.shape[-1]:
+        raise ValueError(
+            f"the query's features have {query.features.shape[-1]} channels and the templates' "
+            f"{templates.patches.features.shape[-1]}: they must come from the same encoder"
+        )
+    patches = templates.patches
+    found = nearest(
+        query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes
+    )
+    distance = jax.vmap(cycle_distance, (0, 0, None, None, 0))(
+        found.query_to_template, found.template_to_query, query.grid, query.valid, patches.valid
+    )
+    pairs = min(config.pairs, query.valid.shape[0])
+    if config.ranking == "cyclic":
+        order, near, cosine = jax.vmap(_order)(distance, found.query_similarity)
+        near, cosine = near[:, :pairs], jnp.where(jnp.isfinite(near), cosine, 0)[:, :pairs]
+        # A missing pair costs the grid's diagonal, so that a view with few pairs does not win by having few terms.
+        worst = jnp.sqrt(jnp.sum(jnp.max(query.grid, axis=0) ** 2)) + 1
+        cost = jnp.sum(jnp.minimum(near, worst), axis=1)
+        ranking = -cost
+        view = lax.sort((cost, -jnp.sum(cosine, axis=1), jnp.arange(cost.shape[0])), num_keys=2)[2][: config.views]
+    else:
+        kept = (distance <= config.cycle) & query.valid
+        ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(jnp.sum(query.valid), 1)
+        view = lax.top_k(ranking, min(config.views, ranking.shape[0]))[1]
+    order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
+    order = order[:, :pairs]
+    return Matches(
+        ranking=ranking,
+        view=view,
+        query=order,
+        template=jnp.take_along_axis(found.query_to_template[view], order, axis=1),
+        distance=near[:, :pairs],
+        similarity=cosine[:, :pairs],
+    )
+
+
+def _order(distance: Float[Array, "p"], similarity: Float[Array, "p"]):
+    """Patches by distance, then cosine (high first), then index; a total order, so the result is the same everywhere."""
+    index = jnp.arange(distance.shape[0])
+    near, negative, index = lax.sort((distance, -similarity, index), num_keys=2, is_stable=True)
+    return index, near, -negative
+
+
+def select(
+    matches: Matches, query: Patches, templates: Templates, config: MatchConfig = MatchConfig()  # noqa: B008
+) -> Pairs:
+    """Lift matches to pairs of 3-D points, ``[v k]``; the weight falls with the cycle and rises with the cosine."""
+    points = templates.patches.points[matches.view]
+    use = (matches.distance <= config.cycle) & jnp.isfinite(matches.distance)
+    weight = jnp.maximum(matches.similarity, 0) / (1 + jnp.where(use, matches.distance, 0))
+    return Pairs(
+        object=jnp.take_along_axis(points, matches.template[..., None], axis=1),
+        camera=query.points[matches.query],
+        weight=jnp.where(use, weight, 0),
+    )

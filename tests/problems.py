@@ -1,0 +1,137 @@
+"""Whole problems with known answers, made of formulas: an ellipsoid whose colour is its own coordinate.
+
+Shared by tests, notebooks and benchmarks. The stand-in encoder turns that coordinate into smooth random features, so
+matching is as hard as the noise asked for, no weights are needed, and every image is exact.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ipjax.features import describe
+from ipjax.host.viewpoints import viewpoints
+from ipjax.types import Camera, Query, Similarity, Surface, Templates, View
+
+AXES = np.array([0.28, 0.38, 0.5])  # semi-axes; the longest makes the diameter 1
+PATCH = 14
+
+
+class CoordinateEncoder(eqx.Module):
+    """Random Fourier features of the mean colour of each patch."""
+
+    frequencies: Float[Array, "3 c"]
+    phases: Float[Array, "c"]
+
+    def __call__(self, image: Float[Array, "h w 3"]) -> Float[Array, "gh gw c"]:
+        height, width, _ = image.shape
+        cells = image.reshape(height // PATCH, PATCH, width // PATCH, PATCH, 3)
+        inked = jnp.any(cells > 0, axis=-1, keepdims=True).astype(image.dtype)
+        mean = jnp.sum(cells * inked, axis=(1, 3)) / jnp.maximum(jnp.sum(inked, axis=(1, 3)), 1)
+        angle = jnp.sum(mean[..., :, None] * self.frequencies, axis=-2) + self.phases
+        wave = jnp.cos(angle)
+        return wave / jnp.linalg.norm(wave, axis=-1, keepdims=True)
+
+
+def make_encoder(channels: int = 32, seed: int = 0) -> CoordinateEncoder:
+    rng = np.random.default_rng(seed)
+    return CoordinateEncoder(
+        jnp.asarray(rng.normal(0, 5, (3, channels)), jnp.float32),
+        jnp.asarray(rng.uniform(0, 2 * np.pi, channels), jnp.float32),
+    )
+
+
+def see(camera_from_object: Similarity, side: int, fill: float = 0.83) -> View:
+    """The ellipsoid's exact image; depth in the unit of the pose's translation; the camera frames the object."""
+    rotation = np.asarray(camera_from_object.rotation, np.float64)
+    translation = np.asarray(camera_from_object.translation, np.float64)
+    scale = float(camera_from_object.scale)
+    reach = 0.5 * scale / np.linalg.norm(translation)
+    focal = fill * side / 2 / reach
+    centre = (side - 1) / 2 - focal * translation[:2] / translation[2]
+    columns, rows = np.meshgrid(np.arange(side), np.arange(side))
+    rays = np.stack([(columns - centre[0]) / focal, (rows - centre[1]) / focal, np.ones_like(rows)], -1)
+    origin = -(rotation.T @ translation) / scale / AXES
+    direction = (rays @ rotation) / scale / AXES
+    a, b, c = (direction**2).sum(-1), (direction * origin).sum(-1), (origin**2).sum() - 1
+    root = b**2 - a * c
+    hit = root > 0
+    depth = np.where(hit, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    coordinate = (origin + depth[..., None] * direction) * AXES
+    rgb = np.where(hit[..., None], 0.5 + 0.45 * coordinate / AXES, 0)
+    return View(
+        jnp.asarray(rgb, jnp.float32),
+        jnp.asarray(depth, jnp.float32),
+        jnp.asarray(hit),
+        Camera(jnp.full(2, focal, jnp.float32), jnp.asarray(centre, jnp.float32)),
+    )
+
+
+def make_surface(count: int) -> Surface:
+    index = np.arange(count) + 0.5
+    height, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
+    order = np.random.default_rng(0).permutation(count)  # so that any prefix covers the whole surface
+    unit = np.stack([np.sqrt(1 - height**2) * np.cos(angle), np.sqrt(1 - height**2) * np.sin(angle), height], -1)[order]
+    normals = unit / AXES
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return Surface(
+        jnp.asarray(unit * AXES, jnp.float32), jnp.asarray(normals, jnp.float32), jnp.ones(count, jnp.float32)
+    )
+
+
+def make_templates(directions: int = 8, rolls: int = 1, grid: int = 8, channels: int = 32) -> Templates:
+    """The ellipsoid, onboarded: ``directions × rolls`` templates of ``grid²`` patches."""
+    poses = viewpoints(directions, rolls, distance=3.0)
+    encoder = make_encoder(channels)
+    views, patches = [], []
+    for index in range(directions * rolls):
+        pose = jax.tree.map(lambda x, index=index: x[index], poses)
+        view = see(pose, grid * PATCH)
+        found = describe(encoder, view)
+        inside = jnp.sum((found.points - pose.translation)[:, :, None] * pose.rotation[None], axis=1)
+        patches.append(eqx.tree_at(lambda p: p.points, found, inside))
+        views.append(view.camera)
+    return Templates(
+        patches=jax.tree.map(lambda *x: jnp.stack(x), *patches),
+        seen=jnp.ones((directions * rolls, grid * grid), jnp.float32),
+        camera_from_object=poses,
+        camera=jax.tree.map(lambda *x: jnp.stack(x), *views),
+        surface=make_surface(512),
+        extents=jnp.asarray(2 * AXES, jnp.float32),
+    )
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray:
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def make_query(
+    seed: int, grid: int = 8, channels: int = 32, noise: float = 0.0, occlusion: float = 0.0
+) -> tuple[Query, Similarity]:
+    """A crop of the ellipsoid at a random pose and size, and the truth ``camera_from_object``.
+
+    ``noise`` is added to the features (their norm is 1), ``occlusion`` hides that share of the crop's width.
+    """
+    rng = np.random.default_rng(seed)
+    truth = Similarity(
+        jnp.asarray(random_rotation(rng), jnp.float32),
+        jnp.asarray([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 1.2)], jnp.float32),
+        jnp.asarray(rng.uniform(0.1, 0.3), jnp.float32),
+    )
+    view = see(truth, grid * PATCH)
+    hidden = jnp.arange(grid * PATCH) < occlusion * grid * PATCH
+    view = View(view.rgb, view.depth, view.mask & ~hidden[None, :], view.camera)
+    patches = describe(make_encoder(channels), view)
+    features = patches.features + noise * jnp.asarray(
+        rng.normal(size=patches.features.shape) / channels**0.5, jnp.float32
+    )
+    features = features / jnp.linalg.norm(features, axis=-1, keepdims=True)
+    return Query(eqx.tree_at(lambda p: p.features, patches, features), view), truth
