@@ -1,0 +1,178 @@
+"""Nearest neighbours between a query's patches and every template's, both ways, from one product per template.
+
+Only maxima and indices leave the inner loop; the volume of similarities never exists as a whole.
+"""
+
+import math
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+NO_MATCH = -2.0  # the similarity of a patch that has no neighbour: finite, and below every cosine
+
+
+class Neighbours(NamedTuple):
+    """Nearest neighbours both ways; a patch without one has index 0 and similarity ``NO_MATCH``."""
+
+    query_to_template: Int[Array, "*b v p"]  # patch of the template
+    query_similarity: Float[Array, "*b v p"]
+    template_to_query: Int[Array, "*b v q"]  # patch of the query
+    template_similarity: Float[Array, "*b v q"]
+
+
+@partial(jax.jit, static_argnames=("memory_bytes", "dtype", "implementation"))
+def nearest(
+    query: Float[Array, "p c"],
+    templates: Float[Array, "v q c"],
+    query_valid: Bool[Array, "p"],
+    template_valid: Bool[Array, "v q"],
+    *,
+    memory_bytes: int = 64 * 2**20,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+    implementation: Literal["xla", "pallas"] = "xla",
+) -> Neighbours:
+    """For each query patch the most similar patch of every template, and the other way round.
+
+    Similarities are dot products: cosines if the features are of unit norm. Masks enter before the maximum, so an
+    invalid patch is never matched; ties go to the lowest index. A patch that is itself invalid, or that faces nothing
+    valid, has index 0 and similarity ``NO_MATCH`` = -2.
+
+    ``memory_bytes`` bounds the temporary arrays that grow with the number of patches: several templates are taken at
+    once, or a template is taken in parts, so that their similarities fit. Under ``vmap`` the queries follow one another
+    and share that memory. ``dtype`` is what the features are rounded to before the product, template by template;
+    sums are float32 always. ``implementation``: "xla" runs anywhere and can be exported; "pallas" is one fused kernel
+    on CUDA devices, which keeps similarities out of memory altogether, and "xla" elsewhere.
+
+    No derivative flows through the similarities; take the cosine of the matched features for one.
+
+    Raises ValueError at trace time for shapes that do not fit together, or a bound below one row of similarities.
+
+    InstantPose Eq. 2-3; Goodwin et al., "Zero-Shot Category-Level Object Pose Estimation", ECCV 2022, section 3.2.
+    """
+    if query.ndim != 2 or templates.ndim != 3 or query.shape[-1] != templates.shape[-1]:
+        raise ValueError(
+            "nearest needs query features (p, c) and template features (v, q, c) with the same c; "
+            f"got {query.shape} and {templates.shape}"
+        )
+    if query_valid.shape != query.shape[:1] or template_valid.shape != templates.shape[:2]:
+        raise ValueError(
+            f"nearest needs one flag per patch, {query.shape[:1]} and {templates.shape[:2]}; "
+            f"got {query_valid.shape} and {template_valid.shape}"
+        )
+    if 0 in query.shape or 0 in templates.shape:
+        raise ValueError(f"nearest needs at least one patch and one template; got {query.shape} and {templates.shape}")
+    query, templates = jax.lax.stop_gradient((query, templates))
+    blocks = partial(_search_blocks, memory_bytes=memory_bytes, dtype=jnp.dtype(dtype))
+    with jax.named_scope("nearest"):
+        if implementation == "pallas":
+            from ipjax_kernels.neighbours_pallas import search  # Pallas is a heavy import that few need
+
+            fused = partial(search, dtype=jnp.dtype(dtype))
+            found = jax.lax.platform_dependent(
+                query, templates, query_valid, template_valid, cuda=fused, default=blocks
+            )
+        elif implementation == "xla":
+            found = blocks(query, templates, query_valid, template_valid)
+        else:
+            raise ValueError(f'implementation is "xla" or "pallas", not {implementation!r}')
+        return _blank_missing(Neighbours(*found), query_valid, template_valid)
+
+
+@jax.jit
+def cycle_distance(
+    query_to_template: Int[Array, "p"],
+    template_to_query: Int[Array, "q"],
+    grid: Float[Array, "p 2"],
+    query_valid: Bool[Array, "p"],
+    template_valid: Bool[Array, "q"],
+) -> Float[Array, "p"]:
+    """How far from where it set out a query patch ends after going to the template and back, in units of ``grid``.
+
+    inf for an invalid patch and for one without a match. For one template; ``vmap`` over templates.
+
+    InstantPose Eq. 4: the cycle starts at the query.
+    """
+    patches, others = query_valid.shape[0], template_valid.shape[0]
+    if query_to_template.shape != (patches,) or template_to_query.shape != (others,) or grid.shape != (patches, 2):
+        raise ValueError(
+            f"cycle_distance needs neighbours ({patches},) and ({others},) and grid ({patches}, 2); "
+            f"got {query_to_template.shape}, {template_to_query.shape} and {grid.shape}"
+        )
+    back = template_to_query[query_to_template]
+    distance = jnp.sqrt(jnp.sum((grid - grid[back]) ** 2, axis=-1))
+    return jnp.where(query_valid & template_valid[query_to_template], distance, jnp.inf)
+
+
+def _blank_missing(found, query_valid, template_valid):
+    query_matched = query_valid[None, :] & jnp.any(template_valid, axis=1, keepdims=True)
+    template_matched = template_valid & jnp.any(query_valid)
+    return Neighbours(
+        jnp.where(query_matched, found.query_to_template, 0),
+        jnp.where(query_matched, found.query_similarity, NO_MATCH),
+        jnp.where(template_matched, found.template_to_query, 0),
+        jnp.where(template_matched, found.template_similarity, NO_MATCH),
+    )
+
+
+def _search_blocks(query, templates, query_valid, template_valid, *, memory_bytes, dtype):
+    @jax.custom_batching.sequential_vmap
+    def search(query, templates, query_valid, template_valid):
+        query = query.astype(dtype)
+        step = partial(_search_template, query, query_valid, memory_bytes=memory_bytes)
+        return tuple(jax.lax.map(lambda template: step(*template), (templates, template_valid)))
+
+    return search(query, templates, query_valid, template_valid)
+
+
+def _search_template(query, query_valid, template, template_valid, *, memory_bytes):
+    patches, others = query.shape[0], template.shape[0]
+    rows = max(1, memory_bytes // (4 * patches))
+    if rows >= others:
+        return _search_block(query, query_valid, template, template_valid)
+    # Even parts; the last one is padded with invalid patches.
+    parts = math.ceil(others / rows)
+    rows = math.ceil(others / parts)
+    padding = parts * rows - others
+    template = jnp.pad(template, ((0, padding), (0, 0))).reshape(parts, rows, -1)
+    template_valid = jnp.pad(template_valid, (0, padding)).reshape(parts, rows)
+
+    def advance(best, part):
+        start, features, valid = part
+        found = _search_block(query, query_valid, features, valid)
+        better = found.query_similarity > best[1]
+        index = jnp.where(better, found.query_to_template + start, best[0])
+        similarity = jnp.where(better, found.query_similarity, best[1])
+        return (index, similarity), (found.template_to_query, found.template_similarity)
+
+    start = jnp.zeros(patches, jnp.int32), jnp.full(patches, -jnp.inf, jnp.float32)
+    starts = jnp.arange(parts, dtype=jnp.int32) * rows
+    forth, back = jax.lax.scan(advance, start, (starts, template, template_valid))
+    return Neighbours(*forth, *(x.reshape(-1)[:others] for x in back))
+
+
+def _search_block(query, query_valid, template, template_valid):
+    similarity = jax.lax.dot_general(
+        query,
+        template.astype(query.dtype),
+        (((1,), (1,)), ((), ())),
+        precision=jax.lax.Precision.HIGHEST,
+        preferred_element_type=jnp.float32,
+    )
+    # The barriers keep the compiler from fusing the product's reader with it and from reducing value and index
+    # together: a plain maximum and a comparison vectorise, an argmax does not.
+    similarity = jax.lax.optimization_barrier(similarity)
+    similarity = jnp.where(query_valid[:, None] & template_valid[None, :], similarity, -jnp.inf)
+    best_of_template = jnp.max(similarity, axis=1)
+    best_of_query = jnp.max(similarity, axis=0)
+    similarity, best_of_template, best_of_query = jax.lax.optimization_barrier(
+        (similarity, best_of_template, best_of_query)
+    )
+    shape = similarity.shape
+    columns = jax.lax.broadcasted_iota(jnp.int32, shape, 1)
+    rows = jax.lax.broadcasted_iota(jnp.int32, shape, 0)
+    forth = jnp.min(jnp.where(similarity == best_of_template[:, None], columns, shape[1] - 1), axis=1)
+    back = jnp.min(jnp.where(similarity == best_of_query[None, :], rows, shape[0] - 1), axis=0)
+    return Neighbours(forth, best_of_template, back, best_of_query)
