@@ -21,9 +21,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from ipjax.dinov2 import normalise, position_embedding
+
 _HIGHEST = jax.lax.Precision.HIGHEST
-_IMAGE_MEAN = (0.485, 0.456, 0.406)
-_IMAGE_STD = (0.229, 0.224, 0.225)
 
 
 @dataclass(frozen=True)
@@ -176,8 +176,7 @@ class VisionTokenizer(nnx.Module):
         if size % patch:
             raise ValueError(f"the photo's side of {size} px is not a multiple of the patch of {patch} px")
         side = size // patch
-        image = (image - jnp.asarray(_IMAGE_MEAN, jnp.float32)) / jnp.asarray(_IMAGE_STD, jnp.float32)
-        cut = image.reshape(side, patch, side, patch, 3).transpose(0, 2, 1, 3, 4).reshape(side * side, -1)
+        cut = normalise(image).reshape(side, patch, side, patch, 3).transpose(0, 2, 1, 3, 4).reshape(side * side, -1)
         tokens = jnp.concatenate([self.class_token[...].astype(jnp.float32)[None], self.patches(cut)])
         return tokens + interpolate_positions(self.positions[...].astype(jnp.float32), side)
 
@@ -284,7 +283,7 @@ class TripoSR(nnx.Module):
         planes = self.embeddings[...].astype(jnp.float32)
         return planes.transpose(0, 2, 3, 1).reshape(-1, planes.shape[1])
 
-    def unfold(self, tokens: Float[Array, "n c"]) -> Float[Array, "3 c h w"]:
+    def unfold(self, tokens: Float[Array, "n i"]) -> Float[Array, "3 c h w"]:
         """Tokens of the backbone → the triplane, up-sampled."""
         side = self.config.plane_size
         return self.upsampler(tokens.reshape(3, side, side, -1))
@@ -308,35 +307,13 @@ def prepare_image(image: Float[Array, "h w 3"], size: int = 512) -> Float[Array,
     return jax.image.resize(image, (size, size, image.shape[2]), "linear", antialias=True, precision=_HIGHEST)
 
 
-def _cubic_weights(stored: int, wanted: int) -> np.ndarray:
-    """Rows of bicubic weights (a = −0.75, clamped edges) that stretch ``stored`` positions to ``wanted``.
-
-    The scale carries the +0.1 of the transformers library up to 4.44, with which the checkpoint was trained, and
-    source coordinates follow that scale, not the ratio of the sizes.
-    """
-    a, scale = -0.75, (wanted + 0.1) / stored
-    source = (np.arange(wanted) + 0.5) / scale - 0.5
-    first = np.floor(source).astype(int)
-    weights = np.zeros((wanted, stored))
-    for tap in range(-1, 3):
-        t = np.abs(source - (first + tap))
-        near = (a + 2) * t**3 - (a + 3) * t**2 + 1
-        far = a * t**3 - 5 * a * t**2 + 8 * a * t - 4 * a
-        np.add.at(weights, (np.arange(wanted), np.clip(first + tap, 0, stored - 1)), np.where(t <= 1, near, far))
-    return weights.astype(np.float32)
-
-
 def interpolate_positions(positions: Float[Array, "n c"], side: int) -> Float[Array, "m c"]:
-    """Position embeddings for ``side`` × ``side`` patches; the class token's stays (modeling_vit.py, 4.35)."""
-    stored = round((positions.shape[0] - 1) ** 0.5)
-    if stored * stored + 1 != positions.shape[0]:
-        raise ValueError(f"{positions.shape[0]} position embeddings are not one more than a square number")
-    if stored == side:
-        return positions
-    weights = jnp.asarray(_cubic_weights(stored, side))
-    grid = positions[1:].reshape(stored, stored, -1)
-    stretched = jnp.einsum("yi,xj,ijc->yxc", weights, weights, grid, precision=_HIGHEST)
-    return jnp.concatenate([positions[:1], stretched.reshape(side * side, -1)])
+    """Position embeddings for ``side`` × ``side`` patches; the class token's stays (modeling_vit.py, 4.35).
+
+    The +0.1 in the scale is that of the transformers library up to 4.44, with which the checkpoint was trained.
+    """
+    grid = position_embedding(positions[1:], (side, side), antialias=False, offset=0.1)
+    return jnp.concatenate([positions[:1], grid.reshape(side * side, -1)])
 
 
 # --- the field --------------------------------------------------------------------------------------------------------
