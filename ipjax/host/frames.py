@@ -309,7 +309,7 @@ def _without_specks(mask: np.ndarray) -> tuple[np.ndarray, tuple[int, int, int, 
     keep = np.zeros(count, bool)
     keep[1:] = areas >= 0.02 * areas.max()
     if not keep[1:].all():
-        mask = keep[np.asarray(labels)]
+        mask = keep[np.asarray(labels, np.int64)]
     boxes = stats[keep]
     left, top = boxes[:, cv2.CC_STAT_LEFT].min(), boxes[:, cv2.CC_STAT_TOP].min()
     right = (boxes[:, cv2.CC_STAT_LEFT] + boxes[:, cv2.CC_STAT_WIDTH]).max()
