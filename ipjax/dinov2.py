@@ -47,14 +47,17 @@ class DinoV2Config:
 
 
 _SIZES = {
-    "vits14": dict(width=384, depth=12, heads=6, hidden=1536),
-    "vitb14": dict(width=768, depth=12, heads=12, hidden=3072),
-    "vitl14": dict(width=1024, depth=24, heads=16, hidden=4096),
-    "vitg14": dict(width=1536, depth=40, heads=24, hidden=4096, swiglu=True),
+    "vits14": DinoV2Config(width=384, depth=12, heads=6, hidden=1536),
+    "vitb14": DinoV2Config(width=768, depth=12, heads=12, hidden=3072),
+    "vitl14": DinoV2Config(width=1024, depth=24, heads=16, hidden=4096),
+    "vitg14": DinoV2Config(width=1536, depth=40, heads=24, hidden=4096, swiglu=True),
 }
 PRESETS: dict[str, DinoV2Config] = {
-    **{name: DinoV2Config(**size) for name, size in _SIZES.items()},
-    **{f"{name}_reg": DinoV2Config(**size, registers=4, antialias=True, offset=0.0) for name, size in _SIZES.items()},
+    **_SIZES,
+    **{
+        f"{name}_reg": dataclasses.replace(config, registers=4, antialias=True, offset=0.0)
+        for name, config in _SIZES.items()
+    },
 }
 
 
@@ -126,39 +129,64 @@ def position_embedding(
     return jnp.einsum("hi,wj,ijc->hwc", rows, columns, square, precision=_HIGHEST)
 
 
+def _random(shape: tuple[int, ...], rngs: nnx.Rngs | None, dtype: str = "float32") -> nnx.Param:
+    if rngs is None:  # weights will be filled in; drawing them first takes seconds
+        return nnx.Param(jnp.zeros(shape, dtype))
+    return nnx.Param(0.02 * jax.random.truncated_normal(rngs.params(), -2.0, 2.0, shape, dtype))
+
+
+class Linear(nnx.Module):
+    """A linear layer: products in the config's dtype, their sum in float32."""
+
+    def __init__(self, inputs: int, outputs: int, config: DinoV2Config, rngs: nnx.Rngs | None):
+        self.kernel = _random((inputs, outputs), rngs, config.dtype)
+        self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))
+
+    def __call__(self, x: Float[Array, "*n i"]) -> Float[Array, "*n o"]:
+        kernel = self.kernel[...]
+        product = jnp.matmul(x.astype(kernel.dtype), kernel, precision=_HIGHEST, preferred_element_type=jnp.float32)
+        return product + self.bias[...]
+
+
+class LayerNorm(nnx.Module):
+    """Normalises each token over its channels; epsilon 1e-6, as DINOv2 has it."""
+
+    def __init__(self, config: DinoV2Config):
+        self.scale = nnx.Param(jnp.ones(config.width, jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(config.width, jnp.float32))
+
+    def __call__(self, x: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
+        centred = x - jnp.mean(x, axis=-1, keepdims=True)
+        variance = jnp.mean(centred**2, axis=-1, keepdims=True)
+        return centred * jax.lax.rsqrt(variance + 1e-6) * self.scale[...] + self.bias[...]
+
+
 class Scale(nnx.Module):
     """LayerScale: one learnt factor per channel."""
 
-    def __init__(self, width: int):
-        self.gamma = nnx.Param(jnp.ones(width))
+    def __init__(self, config: DinoV2Config):
+        self.gamma = nnx.Param(jnp.ones(config.width, jnp.float32))
 
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         return x * self.gamma[...]
 
 
-def _linear(inputs: int, outputs: int, config: DinoV2Config, rngs: nnx.Rngs) -> nnx.Linear:
-    dtype = jnp.dtype(config.dtype)
-    return nnx.Linear(inputs, outputs, dtype=dtype, param_dtype=dtype, precision=_HIGHEST, rngs=rngs)
-
-
-def _norm(config: DinoV2Config, rngs: nnx.Rngs) -> nnx.LayerNorm:
-    return nnx.LayerNorm(config.width, epsilon=1e-6, use_fast_variance=False, dtype=jnp.float32, rngs=rngs)
-
-
 class Attention(nnx.Module):
     """Multi-head self-attention; the softmax is in float32."""
 
-    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs):
+    def __init__(self, config: DinoV2Config, rngs: nnx.Rngs | None):
         self.heads = config.heads
-        self.qkv = _linear(config.width, 3 * config.width, config, rngs)
-        self.proj = _linear(config.width, config.width, config, rngs)
+        self.dtype = config.dtype
+        self.qkv = Linear(config.width, 3 * config.width, config, rngs)
+        self.proj = Linear(config.width, config.width, config, rngs)
 
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         b, n, c = x.shape
-        query, key, value = jnp.moveaxis(self.qkv(x).reshape(b, n, 3, self.heads, c // self.heads), (2, 3), (0, 2))
+        split = self.qkv(x).astype(self.dtype).reshape(b, n, 3, self.heads, c // self.heads)
+        query, key, value = jnp.moveaxis(split, (2, 3), (0, 2))
         query = query * (c // self.heads) ** -0.5
         logits = jnp.einsum("bhnd,bhmd->bhnm", query, key, precision=_HIGHEST, preferred_element_type=jnp.float32)
-        weights = jax.nn.softmax(logits, axis=-1).astype(value.dtype)
+        weights = jax.nn.softmax(logits, axis=-1).astype(self.dtype)
         mixed = jnp.einsum("bhnm,bhmd->bhnd", weights, value, precision=_HIGHEST)
         return self.proj(jnp.moveaxis(mixed, 1, 2).reshape(b, n, c))
 
@@ -166,9 +194,9 @@ class Attention(nnx.Module):
 class FeedForward(nnx.Module):
     """Two layers with an exact GELU between."""
 
-    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs):
-        self.fc1 = _linear(config.width, config.hidden, config, rngs)
-        self.fc2 = _linear(config.hidden, config.width, config, rngs)
+    def __init__(self, config: DinoV2Config, rngs: nnx.Rngs | None):
+        self.fc1 = Linear(config.width, config.hidden, config, rngs)
+        self.fc2 = Linear(config.hidden, config.width, config, rngs)
 
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         inner = self.fc1(x)
@@ -179,9 +207,9 @@ class FeedForward(nnx.Module):
 class GatedFeedForward(nnx.Module):
     """SwiGLU: half of the inner channels gate the other half (ViT-g)."""
 
-    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs):
-        self.w12 = _linear(config.width, 2 * config.hidden, config, rngs)
-        self.w3 = _linear(config.hidden, config.width, config, rngs)
+    def __init__(self, config: DinoV2Config, rngs: nnx.Rngs | None):
+        self.w12 = Linear(config.width, 2 * config.hidden, config, rngs)
+        self.w3 = Linear(config.hidden, config.width, config, rngs)
 
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
         gate, inner = jnp.split(self.w12(x), 2, axis=-1)
@@ -191,25 +219,25 @@ class GatedFeedForward(nnx.Module):
 class Block(nnx.Module):
     """One transformer block; the residual stream is float32."""
 
-    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs):
-        self.norm1 = _norm(config, rngs)
-        self.attn = Attention(config, rngs=rngs)
-        self.ls1 = Scale(config.width)
-        self.norm2 = _norm(config, rngs)
-        self.mlp = (GatedFeedForward if config.swiglu else FeedForward)(config, rngs=rngs)
-        self.ls2 = Scale(config.width)
+    def __init__(self, config: DinoV2Config, rngs: nnx.Rngs | None):
+        self.norm1 = LayerNorm(config)
+        self.attn = Attention(config, rngs)
+        self.ls1 = Scale(config)
+        self.norm2 = LayerNorm(config)
+        self.mlp = (GatedFeedForward if config.swiglu else FeedForward)(config, rngs)
+        self.ls2 = Scale(config)
 
     def __call__(self, x: Float[Array, "b n c"]) -> Float[Array, "b n c"]:
-        x = x + self.ls1(self.attn(self.norm1(x)).astype(jnp.float32))
-        return x + self.ls2(self.mlp(self.norm2(x)).astype(jnp.float32))
+        x = x + self.ls1(self.attn(self.norm1(x)))
+        return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 class PatchEmbedding(nnx.Module):
     """Non-overlapping patches, each through one linear layer."""
 
-    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs):
+    def __init__(self, config: DinoV2Config, rngs: nnx.Rngs | None):
         self.patch = config.patch
-        self.proj = _linear(config.patch**2 * 3, config.width, config, rngs)
+        self.proj = Linear(config.patch**2 * 3, config.width, config, rngs)
 
     def __call__(self, images: Float[Array, "b H W 3"]) -> Float[Array, "b h w c"]:
         b, height, width, _ = images.shape
@@ -219,18 +247,17 @@ class PatchEmbedding(nnx.Module):
 
 
 class DinoV2(nnx.Module):
-    """The vision transformer, randomly initialised; ``ipjax.host.weights`` fills in published weights."""
+    """The vision transformer: random when given ``rngs``, else with zeros to be filled (``ipjax.host.weights``)."""
 
-    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs):
-        normal = nnx.initializers.normal(0.02)
+    def __init__(self, config: DinoV2Config, *, rngs: nnx.Rngs | None = None):
         self.config = config
-        self.cls_token = nnx.Param(normal(rngs.params(), (1, 1, config.width)))
-        self.pos_embed = nnx.Param(normal(rngs.params(), (1, 1 + config.grid**2, config.width)))
+        self.cls_token = _random((1, 1, config.width), rngs)
+        self.pos_embed = _random((1, 1 + config.grid**2, config.width), rngs)
         if config.registers:
-            self.register_tokens = nnx.Param(normal(rngs.params(), (1, config.registers, config.width)))
-        self.patch_embed = PatchEmbedding(config, rngs=rngs)
-        self.blocks = nnx.List([Block(config, rngs=rngs) for _ in range(config.depth)])
-        self.norm = _norm(config, rngs)
+            self.register_tokens = _random((1, config.registers, config.width), rngs)
+        self.patch_embed = PatchEmbedding(config, rngs)
+        self.blocks = nnx.List([Block(config, rngs) for _ in range(config.depth)])
+        self.norm = LayerNorm(config)
 
     def __call__(self, images: Float[Array, "*b h w 3"]) -> Tokens:
         """The last block's tokens under the final LayerNorm, of RGB images in [0, 1]; see ``tokens``."""
@@ -240,7 +267,7 @@ class DinoV2(nnx.Module):
 def embed(model: DinoV2, images: Float[Array, "b h w 3"]) -> Float[Array, "b n c"]:
     """The tokens that enter the first block (class, registers, patches) of ImageNet-normalised images."""
     config = model.config
-    patches = model.patch_embed(images.astype(jnp.float32)).astype(jnp.float32)
+    patches = model.patch_embed(images)
     b, rows, columns, c = patches.shape
     embedding = model.pos_embed[...]
     where = position_embedding(embedding[0, 1:], (rows, columns), antialias=config.antialias, offset=config.offset)
