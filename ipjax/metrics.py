@@ -201,7 +201,8 @@ def vsd(
         tolerances: tau, as shares of the diameter; BOP's ten when None.
 
     The share of the union of both visible masks that is in one of them only, or whose two distances to the camera
-    differ by tau diameters or more. 1 where nothing is visible. BOP sets it to 1 where ``projections_overlap`` is false.
+    differ by tau diameters or more. 1 where nothing is visible. BOP sets it to 1 where
+    ``projections_overlap`` is false.
     """
     if not depth_seen.shape == depth_truth.shape == depth_estimate.shape:
         raise ValueError(
