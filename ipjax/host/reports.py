@@ -1,0 +1,143 @@
+"""Estimates as JSON: every frame and unit named, and poses told in the user's own mesh coordinates."""
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ipjax.host.objects import ObjectInfo
+from ipjax.types import PoseEstimate, Similarity, Templates
+
+CONVENTIONS = {
+    "camera": "OpenCV axes of the colour camera: x right, y down, z ahead; metres; pixel centres are integers",
+    "mesh": "coordinates as they stand in the mesh file, in the file's own unit",
+    "object": "normalised object: bounding box centred at the origin, diameter 1 (model units)",
+    "similarity": "x_camera = scale * rotation @ x + translation; rotation row by row",
+    "matrix": "4 x 4, row by row, [scale * rotation, translation; 0 0 0 1]: x_camera = matrix @ (x, 1)",
+    "rigid_matrix": "4 x 4, row by row, [rotation, translation; 0 0 0 1]: x_camera = rigid_matrix @ (scale * x, 1)",
+    "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
+}
+
+
+def compose(a_from_b: Similarity, b_from_c: Similarity) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation, translation and scale of ``a_from_c``, in double precision."""
+    outer, inner = (
+        tuple(np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
+        for pose in (a_from_b, b_from_c)
+    )
+    rotation = outer[0] @ inner[0]
+    return rotation, outer[2] * outer[0] @ inner[1] + outer[1], float(outer[2] * inner[2])
+
+
+def tell_pose(rotation: np.ndarray, translation: np.ndarray, scale: float, unit: str) -> dict[str, Any]:
+    """A similarity to camera metres as JSON can say it; `unit` names what the scale is per."""
+    rigid, full = np.eye(4), np.eye(4)
+    rigid[:3, :3], full[:3, :3] = rotation, scale * rotation
+    rigid[:3, 3] = full[:3, 3] = translation
+    return {
+        "matrix": full.tolist(),
+        "rigid_matrix": rigid.tolist(),
+        "rotation": rotation.tolist(),
+        "translation_m": translation.tolist(),
+        f"scale_m_per_{unit}": scale,
+    }
+
+
+def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo, alternatives: int = 4) -> dict:
+    """One object's estimate as JSON can say it; `pose` is null where none was found.
+
+    ``camera_from_mesh`` maps the coordinates of the user's mesh file to camera metres; ``camera_from_object`` maps the
+    normalised object.
+    """
+    found = bool(estimate.success) and all(
+        np.isfinite(np.asarray(x)).all()
+        for x in (
+            estimate.camera_from_object.rotation,
+            estimate.camera_from_object.translation,
+            estimate.camera_from_object.scale,
+        )
+    )
+    told: dict[str, Any] = {
+        "object": info.name,
+        "mesh_file": info.mesh_file,
+        "mesh_sha256": info.mesh_sha256,
+        "success": found,
+        "confidence": float(estimate.confidence) if found else 0.0,
+        "camera_from_mesh": None,
+        "camera_from_object": None,
+    }
+    if not found:
+        return told
+    pose = estimate.camera_from_object
+    rotation, translation, scale = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
+    told["camera_from_mesh"] = tell_pose(*compose(pose, info.object_from_mesh), "mesh_unit")
+    told["camera_from_object"] = tell_pose(rotation, translation, float(scale), "model_unit")
+    told["size_mm"] = {
+        "diameter": 1e3 * float(scale),
+        "box": [1e3 * float(scale) * float(side) for side in np.asarray(templates.extents)],
+    }
+    if info.metres_per_unit is not None:
+        told["size_from_mesh_mm"] = {"diameter": 1e3 * info.metres_per_unit / info.mesh_scale}
+    told["inliers"] = int(estimate.inliers)
+    told["residual_rms_mm"] = 1e3 * float(estimate.rmse)
+    told["template"] = int(estimate.view)
+    told["alternatives"] = []
+    scores = np.asarray(estimate.hypotheses.score)
+    for i in range(1, min(alternatives + 1, len(scores))):
+        many = estimate.hypotheses.camera_from_object
+        other = Similarity(many.rotation[i], many.translation[i], many.scale[i])
+        finite = all(np.isfinite(np.asarray(x)).all() for x in (other.rotation, other.translation, other.scale))
+        if scores[i] <= 0 or not finite:
+            continue
+        told["alternatives"].append(
+            {
+                "confidence": float(scores[i]),
+                "camera_from_mesh": tell_pose(*compose(other, info.object_from_mesh), "mesh_unit"),
+            }
+        )
+    return told
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file that appears whole or not at all.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    path = Path(path)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(temporary, 0o666 & ~mask)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def to_json(value: Any) -> str:
+    """JSON with short lists of numbers on one line each, so that matrices can be read.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+
+    def is_flat(item: Any) -> bool:
+        return isinstance(item, list) and all(isinstance(x, int | float | str) for x in item)
+
+    def text(item: Any, indent: int) -> str:
+        pad = "  " * (indent + 1)
+        if isinstance(item, dict) and item:
+            inner = ",\n".join(f"{pad}{json.dumps(str(k))}: {text(v, indent + 1)}" for k, v in item.items())
+            return "{\n" + inner + "\n" + "  " * indent + "}"
+        if isinstance(item, list) and item and not is_flat(item):
+            return "[\n" + ",\n".join(pad + text(v, indent + 1) for v in item) + "\n" + "  " * indent + "]"
+        return json.dumps(item, allow_nan=False, ensure_ascii=False)
+
+    return text(value, 0) + "\n"
