@@ -4,6 +4,8 @@ MuJoCo reads MUJOCO_GL when it is imported and a wrong value can abort the proce
 this child runs GL. It needs NumPy and MuJoCo alone, to start fast. Arguments: the folder of the job. In: ``job.json``
 and the arrays beside it. Out: ``rgb.npy``, ``depth.npy``, ``ids.npy``, and one line per frame on standard output.
 """
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's bindings declare their names at run time.)
 
 import json
 import sys
@@ -11,6 +13,14 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+
+
+def stand_in(count: int) -> np.ndarray:
+    """Points spread over the unit sphere."""
+    height = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    around = np.sqrt(1 - height**2)
+    return np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1)
 
 
 def build_model(folder: Path, job: dict) -> mujoco.MjModel:
@@ -22,7 +32,8 @@ def build_model(folder: Path, job: dict) -> mujoco.MjModel:
     arrays = [dict(np.load(folder / f"mesh{i}.npz")) for i in range(job["meshes"])]
     for i, mesh in enumerate(arrays):
         item = spec.add_mesh(name=f"mesh{i}")
-        item.uservert = mesh["vertices"].ravel().tolist()
+        # The compiler measures a volume, which a flat or tiny mesh lacks: show it a ball of as many points instead.
+        item.uservert = stand_in(len(mesh["vertices"])).ravel().tolist()
         item.userface = mesh["faces"].ravel().tolist()
         item.usernormal = mesh["normals"].ravel().tolist()
         item.userfacenormal = mesh["faces"].ravel().tolist()
@@ -46,7 +57,7 @@ def build_model(folder: Path, job: dict) -> mujoco.MjModel:
             type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"mesh{i}", material=f"material{i}", contype=0, conaffinity=0
         )
     model = spec.compile()
-    # The compiler moves every mesh into its frame of inertia; undo it exactly, so that geom poses are ours alone.
+    # It also moves every mesh into a frame of its own; our vertices, written now, are in ours.
     for i, mesh in enumerate(arrays):
         start, count = model.mesh_vertadr[i], model.mesh_vertnum[i]
         if count != len(mesh["vertices"]):
@@ -123,7 +134,11 @@ def main(folder: Path) -> None:
     frames, height, width, factor = len(poses), job["height"], job["width"], job["oversample"]
     rows, columns = height * factor, width * factor
 
-    model = build_model(folder, job)
+    try:
+        model = build_model(folder, job)
+    except Exception as error:
+        print("refused", f"{error}".replace("\n", " "), flush=True)
+        sys.exit(1)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     gl = mujoco.GLContext(columns, rows)

@@ -40,6 +40,10 @@ class RenderError(RuntimeError):
     """A backend could not draw; the message names it and what to install."""
 
 
+class _MeshRefusedError(RenderError):
+    """MuJoCo did not take the mesh; no fault of the GL backend."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Renders:
     """Rendered views on the host: NumPy arrays, colours as bytes; `renders[i]` is view i as a `View`."""
@@ -227,6 +231,9 @@ def _draw(job: _Job, backend: str, progress: Callable[[int, int], None] | None) 
             continue
         try:
             return _draw_mujoco(job, name, progress)
+        except _MeshRefusedError as error:
+            log.warning("%s; rendering with the z-buffer rasteriser", error)
+            return _draw_raster(job, progress)
         except RenderError as error:
             _broken[name] = str(error)
     log.warning("no GL library works, rendering with the z-buffer rasteriser: %s", "; ".join(_broken.values()))
@@ -266,9 +273,11 @@ def _write_job(job: _Job, folder: Path) -> None:
             uv, uv_faces, texture = _face_atlas(mesh)
             atlases.append(i)
         normals = np.where(np.abs(mesh.normals).sum(-1, keepdims=True) > 0, mesh.normals, [0.0, 0.0, 1.0])
+        spare = np.zeros(max(4 - len(normals), 0), np.int64)  # MuJoCo takes four vertices or more
+        vertices, normals = (np.concatenate([x, x[spare]]) for x in (mesh.vertices, normals))
         np.savez(
             folder / f"mesh{i}.npz",
-            vertices=mesh.vertices.astype(np.float32),
+            vertices=vertices.astype(np.float32),
             faces=mesh.faces.astype(np.int32),
             normals=normals.astype(np.float32),
             uv=uv.astype(np.float32),
@@ -340,6 +349,8 @@ def _draw_mujoco(job: _Job, backend: str, progress: Callable[[int, int], None] |
                 process.wait()
                 if process.stdout is not None:
                     process.stdout.close()
+        if reason is not None and reason.startswith("refused "):
+            raise _MeshRefusedError(f"MuJoCo refuses the mesh ({reason[8:][:300]})")
         if reason is not None:
             lines = (folder / "stderr.txt").read_text(errors="replace").strip().splitlines()
             detail = reason or (lines[-1] if lines else f"the process ended with status {process.returncode}")
@@ -378,6 +389,8 @@ def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int]
             word, _, rest = line.strip().partition(" ")
             if word == "frame" and progress is not None:
                 progress(int(rest), total)
+            elif word == "refused":
+                return f"refused {rest}"
             elif word == "error":
                 return rest
             elif word == "done":
