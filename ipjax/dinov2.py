@@ -293,6 +293,8 @@ def tokens(
     are float32, whatever the model's dtype.
     """
     config = model.config
+    if images.ndim < 3 or images.shape[-1] != 3:
+        raise ValueError(f"an image is [height, width, 3 channels], or a batch of such, not {images.shape}")
     *batch, height, width, _ = images.shape
     if height % config.patch or width % config.patch or not height or not width:
         raise ValueError(f"the image is {height} × {width}; its sides must be multiples of {config.patch} pixels")
