@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import point_map
 from ipjax.config import DescribeConfig
-from ipjax.types import Patches, View
+from ipjax.types import Patches, Query, View
 
 
 def describe(
@@ -40,6 +40,18 @@ def describe(
         grid=grid.reshape(-1, 2),
         valid=cover >= config.cover,
     )
+
+
+def observe(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
+    view: View,
+    config: DescribeConfig = DescribeConfig(),  # noqa: B008
+) -> Query:
+    """``describe`` a crop of the scene and keep the crop beside its patches, as ``estimate`` takes it.
+
+    Args and errors: as :func:`describe`; depth in metres.
+    """
+    return Query(describe(encoder, view, config), view)
 
 
 def lift(

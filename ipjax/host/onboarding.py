@@ -1,6 +1,8 @@
 """From a mesh to templates: render the object from everywhere, describe every view, lift every patch."""
 
-import equinox as eqx
+import dataclasses
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,11 @@ from tqdm import tqdm
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.features import describe
-from ipjax.host.meshes import Mesh, sample_surface
+from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_surface
+from ipjax.host.objects import ObjectInfo, save
 from ipjax.host.rendering import render
 from ipjax.host.viewpoints import viewpoints
+from ipjax.host.weights import hash_file, load_encoder
 from ipjax.types import Camera, Patches, Similarity, Surface, Templates, View
 
 
@@ -54,13 +58,15 @@ def make_templates(
     """
     poses = viewpoints(config.directions, config.rolls, distance=config.distance)
     cameras = framing_cameras(mesh.vertices, poses, config.resolution, config.fill)
-    views = render(
-        mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress
-    )
+    views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)
+    views = dataclasses.replace(views, camera=jax.tree.map(np.asarray, cameras))
     surface = Surface(*(jnp.asarray(x, jnp.float32) for x in sample_surface(mesh, config.surface, seed=0)))
     patches, seen = [], []
+    held = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
     for index in tqdm(range(len(poses.scale)), "describing", unit="view", disable=not progress):
-        view, pose = jax.tree.map(lambda x, index=index: jnp.asarray(x[index]), (views, poses))
+        pose = jax.tree.map(lambda x, index=index: x[index], held)
+        camera = Camera(views.camera.focal[index], views.camera.centre[index])
+        view = View(views.rgb[index], views.depth[index], views.mask[index], camera)
         one, sure = _describe_view(encoder, view, pose, surface, config.describe)
         patches.append(one)
         seen.append(sure)
@@ -80,7 +86,7 @@ def _describe_view(
     encoder: Encoder, view: View, camera_from_object: Similarity, surface: Surface, config: DescribeConfig
 ) -> tuple[Patches, Float[Array, "p"]]:
     """The patches of one template in the object's frame, and how far the surface under each was seen."""
-    view = eqx.tree_at(lambda v: v.rgb, view, view.rgb.astype(jnp.float32) / 255)
+    view = View(view.rgb.astype(jnp.float32) / 255, view.depth, view.mask, view.camera)
     patches = describe(encoder, view, config)
     # x_object = Rᵀ (x_camera − t): the rotation is orthonormal and a template's scale is 1.
     offset = patches.points - camera_from_object.translation
@@ -88,3 +94,54 @@ def _describe_view(
     squared = jnp.sum((points[:, None] - surface.points[None]) ** 2, axis=-1)
     seen = surface.seen[jnp.argmin(squared, axis=1)]
     return Patches(patches.features.astype(jnp.float16), points, patches.grid, patches.valid), seen
+
+
+def onboard(
+    source: str | Path | Mesh,
+    encoder: Encoder | None = None,
+    config: OnboardConfig = OnboardConfig(),  # noqa: B008
+    *,
+    out: str | Path | None = None,
+    name: str | None = None,
+    metres_per_unit: float | None = None,
+    progress: bool = True,
+    backend: str = "auto",
+) -> tuple[Templates, ObjectInfo]:
+    """Make an object ready to be found.
+
+    Args:
+      source: a mesh file (OBJ, PLY, GLB, glTF, STL) or a ``Mesh``.
+      encoder: default: the best weights that are here (``load_encoder()``).
+      out: also write the object file.
+      name: default: the file's.
+      metres_per_unit: the mesh file's unit, where it is known; then the object's size is, too.
+      backend: who renders: ``auto``, ``egl``, ``osmesa``, ``native`` or ``raster``.
+
+    Raises:
+      ValueError: what is not a mesh, or weights that cannot be had; in words.
+    """
+    encoder = load_encoder() if encoder is None else encoder
+    path = None if isinstance(source, Mesh) else Path(source)
+    mesh = source if isinstance(source, Mesh) else load_mesh(source)
+    mesh, repairs = clean(mesh)
+    mesh = normalise(mesh)
+    templates, pictures = make_templates(mesh, encoder, config, progress=progress, backend=backend)
+    info = ObjectInfo(
+        name=name or (path.stem if path else "object"),
+        encoder=encoder.identity,
+        mesh_scale=mesh.scale,
+        mesh_centre=mesh.centre,
+        mesh_file=path.name if path else "",
+        mesh_sha256=hash_file(path) if path else "",
+        metres_per_unit=metres_per_unit,
+        config=dataclasses.asdict(config),
+        notes=(*mesh.notes, *repairs),
+        resolution=config.resolution,
+        vertices=mesh.vertices,
+        faces=mesh.faces,
+        colours=surface_colours(mesh),
+        pictures=pictures,
+    )
+    if out is not None:
+        save(out, templates, info)
+    return templates, info

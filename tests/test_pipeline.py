@@ -1,0 +1,129 @@
+"""The whole estimate on problems with known answers: laws, contracts, and what a bad input does. One tiny shape."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ipjax
+from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
+from ipjax.types import Query, Similarity
+
+TINY = Config(
+    match=MatchConfig(views=2, pairs=64),
+    align=AlignConfig(count=128),
+    refine=RefineConfig(steps=4, points=96),
+    score=ScoreConfig(resolution=28),
+)
+estimate = jax.jit(ipjax.estimate)
+
+
+@pytest.fixture(scope="module")
+def templates():
+    return problems.make_templates()
+
+
+def rotation_error(one: Similarity, other: Similarity) -> float:
+    """Degrees, up to the ellipsoid's own symmetries: half-turns about its axes."""
+    relative = np.asarray(one.rotation, np.float64).T @ np.asarray(other.rotation, np.float64)
+    turns = [np.diag(s) for s in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+    return min(np.degrees(np.arccos(np.clip((np.trace(relative @ t) - 1) / 2, -1, 1))) for t in turns)
+
+
+def same(one, other, tolerance):
+    assert rotation_error(one, other) < np.degrees(tolerance)
+    np.testing.assert_allclose(one.translation, other.translation, atol=tolerance)
+    np.testing.assert_allclose(one.scale, other.scale, rtol=tolerance)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=12)
+def test_recovers_pose_and_size(templates, seed):
+    """Eight directions with no rolls are far apart, so a patch's worth of error is what may remain."""
+    query, truth = problems.make_query(seed)
+    found = estimate(templates, query, jax.random.key(0), TINY)
+    assert bool(found.success)
+    offset = found.camera_from_object.translation - truth.translation
+    assert float(jnp.linalg.norm(offset)) < 0.15 * float(truth.scale)
+    assert abs(float(found.camera_from_object.scale / truth.scale) - 1) < 0.2
+
+
+def test_a_known_size_is_kept(templates):
+    query, truth = problems.make_query(1)
+    found = estimate(templates, query, jax.random.key(0), TINY, diameter=truth.scale)
+    np.testing.assert_allclose(found.camera_from_object.scale, truth.scale, rtol=1e-6)
+    assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.1 * float(truth.scale)
+
+
+def test_the_same_key_gives_the_same_answer(templates):
+    query, _ = problems.make_query(2, noise=0.3)
+    one, other = (estimate(templates, query, jax.random.key(7), TINY) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, one, other)
+
+
+def test_vmap_over_queries_equals_the_loop(templates):
+    queries = [problems.make_query(seed)[0] for seed in (3, 4)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *queries)
+    keys = jax.random.split(jax.random.key(1), 2)
+    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, None)))(templates, stacked, keys, TINY)
+    for index, query in enumerate(queries):
+        alone = estimate(templates, query, keys[index], TINY)
+        one = jax.tree.map(lambda x, index=index: x[index], together)
+        assert int(one.view) == int(alone.view)
+        same(one.camera_from_object, alone.camera_from_object, 2e-3)
+
+
+def test_one_trace_for_all_thresholds_and_keys(templates):
+    traces = []
+
+    @jax.jit
+    def run(query, key, config):
+        traces.append(1)
+        return ipjax.estimate(templates, query, key, config).view
+
+    query, _ = problems.make_query(5)
+    run(query, jax.random.key(0), TINY)
+    looser = eqx.tree_at(lambda c: (c.align.threshold, c.match.cycle, c.score.tolerance), TINY, (0.1, 2.0, 0.05))
+    run(problems.make_query(6)[0], jax.random.key(1), looser)
+    assert len(traces) == 1
+
+
+def test_the_graph_has_no_callback_and_no_lapack(templates):
+    query, _ = problems.make_query(0)
+    text = jax.jit(ipjax.estimate).lower(templates, query, jax.random.key(0), TINY).as_text()
+    assert "callback" not in text and "lapack" not in text and "cusolver" not in text
+    assert text.count("stablehlo") > 100  # it is the graph that was searched
+
+
+def test_scaling_the_object_scales_nothing_but_the_scale(templates):
+    """Model units cancel: templates of half the size give twice the scale and the same pose."""
+    query, _ = problems.make_query(8)
+    half = eqx.tree_at(lambda t: t.patches.points, templates, templates.patches.points / 2)
+    one = ipjax.Config.paper()
+    full = jax.jit(ipjax.estimate)(templates, query, jax.random.key(0), one).camera_from_object
+    # The paper's threshold is relative to the diameter, so it doubles with the model's unit.
+    doubled = eqx.tree_at(lambda c: c.align.threshold, one, one.align.threshold / 2)
+    small = jax.jit(ipjax.estimate)(half, query, jax.random.key(0), doubled).camera_from_object
+    np.testing.assert_allclose(small.scale, 2 * full.scale, rtol=1e-3)
+    np.testing.assert_allclose(small.translation, full.translation, atol=1e-3)
+
+
+def test_nothing_to_match_is_reported_in_numbers(templates):
+    query, _ = problems.make_query(0)
+    nothing = jnp.zeros_like(query.patches.valid)
+    blind = Query(eqx.tree_at(lambda p: p.valid, query.patches, nothing), query.view)
+    found = estimate(templates, blind, jax.random.key(0), TINY)
+    assert not bool(found.success)
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(found) if jnp.issubdtype(x.dtype, jnp.floating))
+    assert float(found.confidence) == 0.0
+
+
+def test_paper_runs_without_refinement(templates):
+    query, truth = problems.make_query(9)
+    found = jax.jit(ipjax.estimate)(templates, query, jax.random.key(0), Config.paper())
+    assert bool(found.success)
+    assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.3 * float(truth.scale)
