@@ -670,7 +670,7 @@ def _sense(rng: np.random.Generator, depth: np.ndarray, camera: Camera, sensor: 
         return depth.astype(np.float32)
     height, width = depth.shape
     rows, columns = np.mgrid[:height, :width]
-    rise, run = np.gradient(depth.astype(np.float64))  # along rows, along columns
+    rise, run = np.gradient(depth.astype(np.float64), axis=0), np.gradient(depth.astype(np.float64), axis=1)
     # The normal of z(u, v) seen by a pinhole: tangents along u and v, crossed.
     (fx, fy), (cx, cy) = np.asarray(camera.focal, float), np.asarray(camera.centre, float)
     rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones((height, width))], -1)

@@ -1,0 +1,132 @@
+"""One way to call everything: what is fixed, what is new, key, config; the rest by keyword. And all of it is told."""
+
+import importlib
+import inspect
+import re
+import typing
+
+import jax
+import numpy as np
+import pytest
+from test_layers import LAYERS, MODULES, layer_of
+
+import ipjax
+
+FIXED = {"encoder", "templates", "surface", "estimator", "model"}  # made once per object, or once
+NEW = {"query", "view", "cloud", "pairs", "patches", "rgb", "depth", "mask", "image", "photo"}  # once per frame
+LAST = ("key", "config")
+# Where the arrow starts comes first: both directions are searched, and the cycle starts at the query.
+AS_KERNEL = {"match", "select", "nearest", "cycle_distance"}
+
+
+def is_public(name: str) -> bool:
+    return not any(part.startswith("_") for part in name.split("."))
+
+
+PURE = [name for name in MODULES if layer_of(name) < LAYERS["ipjax.host"] and is_public(name)]
+HOST = [name for name in MODULES if layer_of(name) == LAYERS["ipjax.host"] and is_public(name)]
+
+
+def list_functions(modules: list[str]) -> dict[str, typing.Any]:
+    """The public functions of modules, and the public methods of their public classes, by their full names."""
+    found = {}
+    for name in modules:
+        module = importlib.import_module(name)
+        for key, value in vars(module).items():
+            if key.startswith("_") or getattr(value, "__module__", None) != name:
+                continue
+            if inspect.isclass(value):
+                if issubclass(value, BaseException):
+                    continue
+                for inner, method in vars(value).items():
+                    plain = inspect.unwrap(getattr(method, "__func__", method))
+                    if inspect.isfunction(plain) and not inner.startswith("_") and plain.__module__ == name:
+                        found[f"{name}.{key}.{inner}"] = plain
+            elif callable(value) and inspect.isfunction(inspect.unwrap(value)):
+                found[f"{name}.{key}"] = inspect.unwrap(value)
+    return found
+
+
+def positional(function) -> list[str]:
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return [p.name for p in inspect.signature(function).parameters.values() if p.kind in kinds and p.name != "self"]
+
+
+def find_disorder(name: str, function) -> list[str]:
+    """What is out of order among the arguments of a function."""
+    names = positional(function)
+    faults = []
+    tail = [n for n in names if n in LAST]
+    if tail and names[-len(tail) :] != [n for n in LAST if n in tail]:
+        faults.append(f"{name}({', '.join(names)}): key, then config, come last; what follows is keyword-only")
+    ranks = [0 if n in FIXED else 1 for n in names if n in FIXED | NEW]
+    if name.rpartition(".")[2] not in AS_KERNEL and ranks != sorted(ranks):
+        faults.append(f"{name}({', '.join(names)}): what is fixed comes before what is new")
+    parameters = inspect.signature(function).parameters
+    if (
+        "config" in parameters
+        and "key" not in parameters
+        and parameters["config"].kind == inspect.Parameter.VAR_KEYWORD
+    ):
+        faults.append(f"{name}: config is one record")
+    return faults
+
+
+@pytest.mark.parametrize("module", [*PURE, *HOST])
+def test_arguments_are_in_order(module):
+    faults = [fault for name, function in list_functions([module]).items() for fault in find_disorder(name, function)]
+    assert faults == []
+
+
+def test_finds_disorder():
+    def late(view, config, key): ...
+
+    def swapped(query, templates): ...
+
+    def good(templates, query, key, config, *, diameter): ...
+
+    assert find_disorder("late", late) and find_disorder("swapped", swapped)
+    assert find_disorder("good", good) == []
+
+
+@pytest.mark.parametrize("module", [*PURE, *HOST])
+def test_everything_public_is_told(module):
+    assert (importlib.import_module(module).__doc__ or "").strip(), f"{module} does not say what it is"
+    for name, function in list_functions([module]).items():
+        if name.startswith("ipjax_kernels.reference"):
+            continue  # the loops are the text
+        assert len((function.__doc__ or "").strip()) > 15, f"{name} has no docstring"
+
+
+def has_bare_array(annotation) -> bool:
+    """Whether an annotation says array and not which shape."""
+    if annotation in (jax.Array, np.ndarray):
+        return True
+    if hasattr(annotation, "array_type") or hasattr(annotation, "dim_str"):
+        return False  # jaxtyping's
+    return any(has_bare_array(inner) for inner in typing.get_args(annotation))
+
+
+@pytest.mark.parametrize("module", PURE)
+def test_shapes_are_in_the_signatures(module):
+    for name, function in list_functions([module]).items():
+        signature = inspect.signature(function)
+        for parameter in signature.parameters.values():
+            if parameter.name in ("self", "cls"):
+                continue
+            assert parameter.annotation is not inspect.Parameter.empty, f"{name}: {parameter.name} has no type"
+            assert not has_bare_array(parameter.annotation), f"{name}: {parameter.name} is an array of no stated shape"
+        assert signature.return_annotation is not inspect.Signature.empty, f"{name} does not say what it returns"
+        assert not has_bare_array(signature.return_annotation), f"{name} returns an array of no stated shape"
+
+
+def test_public_names_exist_and_are_told():
+    for name in getattr(ipjax, "__all__", ()):
+        value = getattr(ipjax, name)
+        if callable(value) and not inspect.isclass(value):
+            assert (value.__doc__ or "").strip(), name
+            assert find_disorder(name, inspect.unwrap(value)) == []
+
+
+def test_version_is_a_version():
+    assert re.fullmatch(r"\d+\.\d+\.\d+([a-z]+\d+)?(\.dev\d+)?", ipjax.__version__)

@@ -1,0 +1,155 @@
+"""Data goes one way: every module imports only from the layers before its own, and importing ipjax costs nothing."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+
+# Where a name stands: a module may import from lower numbers only. The stages of layer 3 do not import one another.
+LAYERS = {
+    "ipjax_kernels": 0,
+    "ipjax.types": 1,
+    "ipjax.config": 1,
+    "ipjax.cameras": 2,
+    "ipjax.dinov2": 2,
+    "ipjax.metrics": 2,
+    "ipjax.triposr": 2,
+    "ipjax.features": 3,
+    "ipjax.matching": 3,
+    "ipjax.alignment": 3,
+    "ipjax.refinement": 3,
+    "ipjax.scoring": 3,
+    "ipjax.pipeline": 4,
+    "ipjax.host": 5,
+    "ipjax.cli": 6,
+    "ipjax.__main__": 7,
+    "ipjax": 8,  # the public names
+}
+MAY_SHARE = {  # modules of one layer that may import their neighbours, and why
+    "ipjax.triposr": {"ipjax.dinov2"},  # two vision transformers of one family share their blocks
+}
+HEAVY = {"mujoco", "cv2", "trimesh", "torch", "scipy", "skimage", "PIL", "matplotlib", "safetensors", "tqdm"}
+OF_KERNELS = {"jax", "jaxtyping", "numpy", "ipjax_kernels", *sys.stdlib_module_names}
+
+
+def find_modules() -> dict[str, Path]:
+    """Every module of both packages, by its dotted name."""
+    found = {}
+    for package in (ROOT / "ipjax", ROOT / "kernels" / "ipjax_kernels"):
+        for path in sorted(package.rglob("*.py")):
+            parts = list(path.relative_to(package.parent).with_suffix("").parts)
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return found
+
+
+MODULES = find_modules()
+
+
+def layer_of(name: str) -> int:
+    """The layer of a module, or of the nearest package above it that has one."""
+    while name not in LAYERS:
+        name, _, _ = name.rpartition(".")
+        assert name, "a module outside ipjax and ipjax_kernels"
+    return LAYERS[name]
+
+
+def list_imports(source: str, module: str, known: set[str]) -> list[tuple[int, str, bool]]:
+    """What a module imports: line, dotted name (a submodule's where that is what is meant), and if at its top level."""
+    tree = ast.parse(source)
+    inner = {
+        child
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for child in ast.walk(node)
+    }
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}:{node.lineno}: a relative import"
+            full = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [name if name in known else str(node.module) for name in full if name != "ipjax.__version__"]
+        else:
+            continue
+        found.extend((node.lineno, name, node not in inner) for name in names)
+    return found
+
+
+def find_faults(source: str, module: str, known: set[str]) -> list[str]:
+    """The imports of a module that go the wrong way."""
+    mine = layer_of(module)
+    faults = []
+    for line, name, _ in list_imports(source, module, known):
+        if name.split(".")[0] not in ("ipjax", "ipjax_kernels"):
+            continue
+        if module == name or (mine == layer_of(name) and mine in (0, 1, 5)):
+            continue  # kernels, records and host modules stand side by side
+        if name == "ipjax" and module != "ipjax":
+            faults.append(f"{module}:{line} imports the public names; import the module that has them")
+        elif layer_of(name) >= mine and name not in MAY_SHARE.get(module, ()):
+            faults.append(f"{module}:{line} imports {name}, which stands after it")
+    return faults
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_only_from_layers_before(module):
+    assert find_faults(MODULES[module].read_text(), module, set(MODULES)) == []
+
+
+def test_public_names_come_from_the_pure_layers():
+    for line, name, top in list_imports(MODULES["ipjax"].read_text(), "ipjax", set(MODULES)):
+        if top and name.startswith("ipjax"):
+            assert layer_of(name) < LAYERS["ipjax.host"], f"line {line} imports {name}, which needs heavy packages"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if layer_of(name) < LAYERS["ipjax.host"]])
+def test_pure_layers_do_without_heavy_packages(module):
+    for line, name, _ in list_imports(MODULES[module].read_text(), module, set(MODULES)):
+        assert name.split(".")[0] not in HEAVY, f"{module}:{line} imports {name}"
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if layer_of(name) == 0])
+def test_kernels_need_only_jax(module):
+    for line, name, _ in list_imports(MODULES[module].read_text(), module, set(MODULES)):
+        assert name.split(".")[0] in OF_KERNELS, f"{module}:{line} imports {name}"
+
+
+def test_no_postponed_annotations():
+    # jaxtyping reads annotations when a function is made; as strings they would check nothing.
+    for module, path in MODULES.items():
+        assert "__future__" not in path.read_text(), module
+
+
+def test_finds_what_goes_back():
+    known = set(MODULES)
+    assert find_faults("from ipjax.types import Camera", "ipjax.cameras", known) == []
+    assert find_faults("from ipjax.pipeline import estimate", "ipjax.matching", known)
+    assert find_faults("from ipjax.alignment import align", "ipjax.matching", known)
+    assert find_faults("from ipjax import host", "ipjax.scoring", known)
+    assert find_faults("def f():\n    import ipjax.host.meshes", "ipjax.features", known)
+    assert find_faults("from ipjax import __version__", "ipjax.host.objects", known) == []
+    assert find_faults("from ipjax import estimate", "ipjax.host.objects", known)
+    assert find_faults("import ipjax", "ipjax.types", known)
+    assert find_faults("from ipjax.types import Camera", "ipjax_kernels.similarity", known)
+
+
+def test_import_is_light():
+    code = """
+import sys, json
+import ipjax
+from jax._src import xla_bridge
+print(json.dumps([sorted({name.split('.')[0] for name in sys.modules}), xla_bridge.backends_are_initialized(),
+                  sorted(name for name in sys.modules if name.startswith('ipjax.host.'))]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/", timeout=120)
+    assert done.returncode == 0, done.stderr
+    loaded, started, host = json.loads(done.stdout)
+    assert not {"mujoco", "cv2", "trimesh", "torch", "matplotlib", "onnx", "onnxruntime"} & set(loaded)
+    assert not started, "importing ipjax started a JAX backend"
+    assert host == []
