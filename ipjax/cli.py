@@ -110,6 +110,8 @@ Everything is in metres and OpenCV camera axes (x right, y down, z ahead) unless
     _add_demo(commands)
     _add_doctor(commands)
     _add_weights(commands)
+    _add_score(commands)
+    _add_degrade(commands)
     return parser
 
 
@@ -162,43 +164,30 @@ _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 
 def _onboard(arguments: argparse.Namespace) -> int:
     output = _check_output(arguments.output, (".ipjax",))
+    if not arguments.mesh.is_file():
+        raise ValueError(f"{arguments.mesh}: no such mesh file")
     from ipjax.config import OnboardConfig
-    from ipjax.host.meshes import load_mesh, normalise
+    from ipjax.host.onboarding import onboard
 
     _use_cache()
-    changes = {k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None}
-    config = OnboardConfig(**changes)
-    mesh = normalise(load_mesh(arguments.mesh))
+    config = OnboardConfig(**{k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None})
     encoder = _load_encoder(arguments)
+    start = time.perf_counter()
+    templates, info = onboard(
+        arguments.mesh,
+        encoder,
+        config,
+        out=output,
+        name=arguments.name,
+        metres_per_unit=None if arguments.unit is None else _UNITS[arguments.unit],
+        progress=not arguments.quiet,
+        backend=arguments.backend,
+    )
     if not arguments.quiet:
         arguments.notes.tell()
-    from ipjax.host.objects import ObjectInfo, save
-    from ipjax.host.onboarding import make_templates
-    from ipjax.host.weights import hash_file
-
-    start = time.perf_counter()
-    templates, pictures = make_templates(mesh, encoder, config, progress=not arguments.quiet, backend=arguments.backend)
-    info = ObjectInfo(
-        name=arguments.name or arguments.mesh.stem,
-        encoder=encoder.identity,
-        mesh_scale=mesh.scale,
-        mesh_centre=mesh.centre,
-        mesh_file=arguments.mesh.name,
-        mesh_sha256=hash_file(arguments.mesh),
-        metres_per_unit=None if arguments.unit is None else _UNITS[arguments.unit],
-        config={k: getattr(config, k) for k in ("directions", "rolls", "resolution", "fill", "distance", "surface")},
-        notes=mesh.notes,
-        resolution=config.resolution,
-        vertices=mesh.vertices,
-        faces=mesh.faces,
-        colours=mesh.colours,
-        pictures=pictures,
-    )
-    save(output, templates, info)
-    if not arguments.quiet:
-        for note in mesh.notes:
+        for note in info.notes:
             print(f"note: {note}")
-        size = 1 / mesh.scale
+        size = 1 / info.mesh_scale
         unit = f"{size * 1e3 * info.metres_per_unit:.1f} mm" if info.metres_per_unit else f"{size:g} mesh units"
         count = len(templates.camera_from_object.scale)
         seconds = time.perf_counter() - start
@@ -581,6 +570,91 @@ def _weights_verify(arguments: argparse.Namespace) -> None:
     from ipjax.host.weights import verify
 
     print(verify(arguments.file).describe())
+
+
+# --- score, degrade ---------------------------------------------------------------------------------------------------
+
+
+def _add_score(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "score",
+        _score,
+        "score a BOP result file against the annotations of a BOP data set",
+        """\
+examples:
+  ipjax score results/ipjax_ycbv-test.csv ycbv/
+  ipjax score mine.csv ycbv/ --metrics mssd mspd add_s --against other.csv --json score.json
+""",
+    )
+    parser.add_argument("results", type=Path, metavar="CSV", help="scene_id,im_id,obj_id,score,R,t,time; t in mm")
+    parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
+    parser.add_argument("--split", default="test", help="which split (default test)")
+    parser.add_argument(
+        "--metrics", nargs="+", choices=("mssd", "mspd", "vsd", "add", "add_s", "ap"), default=("mssd", "mspd", "vsd")
+    )
+    parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the score as JSON")
+    parser.add_argument(
+        "--skip-bad", action="store_true", help="leave damaged rows out and say so, instead of stopping"
+    )
+
+
+def _score(arguments: argparse.Namespace) -> int:
+    if arguments.json is not None:
+        _check_output(arguments.json, (".json",))
+    from ipjax.host.bop import Dataset
+    from ipjax.host.evaluation import score
+
+    dataset = Dataset(arguments.dataset, arguments.split)
+    found = score(
+        arguments.results,
+        dataset,
+        arguments.metrics,
+        against=arguments.against,
+        on_error="skip" if arguments.skip_bad else "raise",
+        progress=sys.stderr.isatty(),
+    )
+    print(found.table())
+    if arguments.json is not None:
+        found.write_json(arguments.json)
+    return 0
+
+
+def _add_degrade(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "degrade",
+        _degrade,
+        "make a mesh worse, as reconstruction models do, and keep the map back to the original",
+        """\
+examples:
+  ipjax degrade mug.glb -o worse.glb --level 2 --alignment worse.json
+""",
+    )
+    parser.add_argument("mesh", metavar="MESH", type=Path)
+    parser.add_argument("-o", "--output", metavar="GLB", type=Path, required=True)
+    parser.add_argument("--level", type=int, default=2, choices=(1, 2, 3, 4), help="4 is worst (default 2)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--alignment", type=Path, metavar="JSON", help="where the map back goes; for evaluation only")
+
+
+def _degrade(arguments: argparse.Namespace) -> int:
+    output = _check_output(arguments.output, (".glb",))
+    if arguments.alignment is not None:
+        _check_output(arguments.alignment, (".json",))
+    from ipjax.host.degradation import degrade
+    from ipjax.host.demo import write_mesh
+    from ipjax.host.meshes import load_mesh
+    from ipjax.host.reports import to_json, write_text
+
+    mesh = load_mesh(arguments.mesh)
+    worse, alignment = degrade(mesh, arguments.level, arguments.seed)
+    write_mesh(output, worse)
+    if arguments.alignment is not None:
+        write_text(arguments.alignment, to_json(alignment.as_json()))
+    print(f"{output}: level {arguments.level}")
+    return 0
 
 
 # --- shared -----------------------------------------------------------------------------------------------------------

@@ -58,7 +58,7 @@ class Estimator:
         Raises:
             ValueError: as `frames.frame`.
         """
-        options = {"resolution": self.objects[index][1].resolution} | self.options
+        options: dict[str, Any] = {"resolution": self.objects[index][1].resolution} | self.options
         return frame_turned(rgb, depth, mask, camera, box=box, **options)
 
     def run(
