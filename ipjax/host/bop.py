@@ -235,10 +235,19 @@ class Dataset:
         raise DatasetError(f"{self._folder(scene_id, 'rgb') / f'{im_id:06d}.png'}: no such image (rgb or gray)")
 
     def image_size(self, scene_id: int, im_id: int) -> tuple[int, int]:
-        """(width, height) from the image's header."""
+        """(width, height) from the image's header, or from ``camera.json`` where the images are not there."""
         from PIL import Image
 
-        path = self.image_path(scene_id, im_id)
+        try:
+            path = self.image_path(scene_id, im_id)
+        except DatasetError:
+            whole = self.root / "camera.json"
+            if not whole.is_file():
+                raise
+            entry = self._json(whole)
+            return tuple(
+                int(x) for x in _numbers({"size": [entry.get("width"), entry.get("height")]}, "size", 2, str(whole))
+            )  # type: ignore[return-value]
         try:
             with Image.open(path) as image:
                 return image.size
