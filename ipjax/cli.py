@@ -111,6 +111,7 @@ Everything is in metres and OpenCV camera axes (x right, y down, z ahead) unless
     _add_doctor(commands)
     _add_weights(commands)
     _add_score(commands)
+    _add_evaluate(commands)
     _add_degrade(commands)
     return parser
 
@@ -274,11 +275,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
     objects = [load(path) for path in arguments.objects]
     encoder = _matching_encoder(arguments, [info.encoder for _, info in objects])
     for path, (_, info) in zip(arguments.objects, objects, strict=True):
-        if info.encoder != encoder.identity:
-            raise ValueError(
-                f"{path}: made with the encoder '{info.encoder}', but the one at hand is '{encoder.identity}'; "
-                "onboard the object again, or give the weights it was made with"
-            )
+        _check_encoder(path, info.encoder, encoder)
     if not arguments.quiet:
         arguments.notes.tell()
     _use_cache()
@@ -572,7 +569,7 @@ def _weights_verify(arguments: argparse.Namespace) -> None:
     print(verify(arguments.file).describe())
 
 
-# --- score, degrade ---------------------------------------------------------------------------------------------------
+# --- score, evaluate, degrade ------------------------------------------------------------------------------------------
 
 
 def _add_score(commands: Any) -> None:
@@ -618,6 +615,105 @@ def _score(arguments: argparse.Namespace) -> int:
     print(found.table())
     if arguments.json is not None:
         found.write_json(arguments.json)
+    return 0
+
+
+def _add_evaluate(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "evaluate",
+        _evaluate,
+        "estimate every target of a BOP data set with its annotated masks, and score the result",
+        """\
+examples:
+  for i in ycbv/models/*.ply; do ipjax onboard $i --unit mm -o objects/$(basename $i .ply).ipjax; done
+  ipjax evaluate ycbv/ --objects objects/ -o results/
+
+Stop it at any moment and call it again: finished images are not done twice.
+""",
+    )
+    parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
+    parser.add_argument(
+        "--objects",
+        type=Path,
+        metavar="FOLDER",
+        required=True,
+        help="of object files named by number: obj_000001.ipjax",
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", required=True, help="for the results")
+    parser.add_argument("--split", default="test", help="which split (default test)")
+    parser.add_argument("--method", choices=("best", "paper"), default="best", help="settings (default: best)")
+    parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    _add_encoder(parser, block=False)
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    import re
+
+    if not arguments.objects.is_dir():
+        raise ValueError(f"{arguments.objects}: no such folder of object files")
+    numbered = ((re.search(r"(\d+)$", path.stem), path) for path in sorted(arguments.objects.glob("*.ipjax")))
+    files = {int(number[1]): path for number, path in numbered if number}
+    if not files:
+        raise ValueError(f"{arguments.objects}: no object files named by number, like obj_000001.ipjax")
+    if arguments.output.exists() and not arguments.output.is_dir():
+        raise ValueError(f"{arguments.output}: a file of this name is in the way")
+    from ipjax.config import Config
+    from ipjax.host.bop import Dataset, Estimate
+    from ipjax.host.estimation import Estimator
+    from ipjax.host.evaluation import evaluate
+    from ipjax.host.objects import load
+    from ipjax.host.reports import compose
+
+    dataset = Dataset(arguments.dataset, arguments.split)
+    objects = {number: load(path) for number, path in files.items()}
+    encoder = _matching_encoder(arguments, [info.encoder for _, info in objects.values()])
+    for number, path in files.items():
+        _check_encoder(path, objects[number][1].encoder, encoder)
+    arguments.notes.tell()
+    _use_cache()
+    config = Config.paper() if arguments.method == "paper" else Config()
+    estimator = Estimator(list(objects.values()), encoder, config, crop=arguments.crop)
+    order = {number: i for i, number in enumerate(objects)}
+
+    def find(frame: Any, targets: list) -> list:
+        found = []
+        for target in targets:
+            i = order.get(target.obj_id)
+            if i is None or frame.depth is None:
+                continue
+            try:
+                crop = estimator.frame(i, frame.rgb, frame.depth, target.mask, frame.camera)
+            except ValueError:  # no depth on the object: a miss
+                continue
+            result = estimator.run(i, *crop, seed=arguments.seed)
+            if not bool(result.estimate.success):
+                continue
+            rotation, translation, scale = compose(result.estimate.camera_from_object, result.info.object_from_mesh)
+            unit = result.info.metres_per_unit or 1e-3  # BOP's models are in millimetres
+            score = target.score * float(result.estimate.confidence)
+            found.append(Estimate(target.obj_id, score, rotation, translation, scale / unit))
+        return found
+
+    settings = {
+        "method": arguments.method,
+        "crop": arguments.crop,
+        "seed": arguments.seed,
+        "encoder": encoder.identity,
+        "objects": {str(number): info.mesh_sha256 for number, (_, info) in objects.items()},
+    }
+    found = evaluate(
+        dataset,
+        list(objects),
+        find,
+        arguments.output,
+        method=f"ipjax-{arguments.method}",
+        settings=settings,
+        progress=not arguments.quiet,
+    )
+    print(found.table())
     return 0
 
 
@@ -712,6 +808,14 @@ def _matching_encoder(arguments: argparse.Namespace, identities: list[str]) -> A
     if encoder is None:
         raise trouble if trouble is not None else ValueError("no weights are here")
     return encoder
+
+
+def _check_encoder(path: Path, wanted: str, encoder: Any) -> None:
+    if wanted != encoder.identity:
+        raise ValueError(
+            f"{path}: made with the encoder '{wanted}', but the one at hand is '{encoder.identity}'; "
+            "onboard the object again, or give the weights it was made with"
+        )
 
 
 def _check_output(path: Path, suffixes: tuple[str, ...]) -> Path:

@@ -198,7 +198,9 @@ def test_doctor_checks_object_files(case, capfd):
     assert "checksum" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["", "onboard", "estimate", "demo", "doctor", "weights", "score", "degrade"])
+@pytest.mark.parametrize(
+    "name", ["", "onboard", "estimate", "demo", "doctor", "weights", "score", "evaluate", "degrade"]
+)
 def test_help_teaches_by_examples(name, capfd):
     assert run([*name.split(), "--help"]) == 0
     out = capfd.readouterr().out
