@@ -58,13 +58,18 @@ def layer_of(name: str) -> int:
     return LAYERS[name]
 
 
+def is_for_types(node: ast.AST) -> bool:
+    """Whether this is ``if TYPE_CHECKING:``, which never runs."""
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
 def list_imports(source: str, module: str, known: set[str]) -> list[tuple[int, str, bool]]:
     """What a module imports: line, dotted name (a submodule's where that is what is meant), and if at its top level."""
     tree = ast.parse(source)
     inner = {
         child
         for node in ast.walk(tree)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) or is_for_types(node)
         for child in ast.walk(node)
     }
     found = []
