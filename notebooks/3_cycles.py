@@ -67,7 +67,11 @@ error = np.linalg.norm(grid[np.asarray(there)] - where, axis=-1)  # of the match
 similarity = np.asarray(found.query_similarity[0])
 
 fig, axes = plt.subplots(1, 3, figsize=(10, 3.4))
-pictures = (("cosine of the match", similarity, None), ("cyclic distance, patches", distance, 8), ("true error", error, 8))
+pictures = (
+    ("cosine of the match", similarity, None),
+    ("cyclic distance, patches", distance, 8),
+    ("true error", error, 8),
+)
 for axis, (title, values, top) in zip(axes, pictures, strict=True):
     image = axis.imshow(values.reshape(side, side), vmax=top)
     axis.contour(hidden.reshape(side, side), [0.5], colors="red", linewidths=1)
