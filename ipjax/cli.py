@@ -569,7 +569,7 @@ def _weights_verify(arguments: argparse.Namespace) -> None:
     print(verify(arguments.file).describe())
 
 
-# --- score, evaluate, degrade ------------------------------------------------------------------------------------------
+# --- score, evaluate, degrade -----------------------------------------------------------------------------------------
 
 
 def _add_score(commands: Any) -> None:
