@@ -71,12 +71,11 @@ format: $(READY)
 	$(BIN)/ruff format .
 
 bench: $(READY)
-	@for script in benchmarks/*_speed.py benchmarks/speed.py; do \
-	  if [ -f "$$script" ]; then echo "== $$script"; $(RUN) "$$script" || exit 1; fi; done
+	$(RUN) -m benchmarks
 
 DATA ?= ../shared/data/ycbv
 eval: $(READY)
-	$(RUN) benchmarks/accuracy.py $(DATA)
+	$(BIN)/ipjax evaluate $(DATA) -o out/evaluation
 
 notebooks: $(READY)
 	@for script in notebooks/*.py; do \

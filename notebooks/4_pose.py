@@ -11,9 +11,9 @@
 # %% [markdown]
 # # One frame to one pose, and how it fails
 #
-# The whole way, small: onboard, look, estimate. So that nothing is downloaded, the encoder is a **stand-in**: the object
-# is painted with its own coordinates, and the "features" are waves of a patch's mean colour. It matches better than any
-# network on a real object; what comes after the features is the real thing.
+# The whole way, small: onboard, look, estimate. So that nothing is downloaded, the encoder is a **stand-in**: the
+# object is painted with its own coordinates, and the "features" are waves of a patch's mean colour. It matches better
+# than any network on a real object; what comes after the features is the real thing.
 
 # %%
 import dataclasses
