@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import nnx
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ipjax.dinov2 import normalise, position_embedding
 
@@ -374,17 +374,21 @@ def density_grid(
     triplane: Float[Array, "3 c h w"],
     resolution: int = 256,
     *,
-    start: int = 0,
+    start: int | Int[Array, ""] = 0,
     count: int | None = None,
 ) -> Float[Array, "x r r"]:
-    """Density at ``resolution``³ points, both faces of the cube included, index (x, y, z); x from start, count of them.
+    """Density at ``resolution``³ points, both faces of the cube included, index (x, y, z).
+
+    Only the x-slabs from ``start`` (may be traced), ``count`` (static) of them, for callers that show progress.
 
     Memory is that of one x-slab (``resolution``² × decoder width): slabs follow one another. On a grid the planes are
     interpolated once per plane, not per point, and the decoder's first product with them: exact, and 3 R² for R³.
     """
-    count = resolution - start if count is None else count
-    if not 0 <= start < start + count <= resolution:
-        raise ValueError(f"slabs {start} to {start + count} do not lie in a grid of {resolution}")
+    if count is None:
+        count = resolution - start if isinstance(start, int) else resolution
+    last = start + count if isinstance(start, int) else count
+    if not 0 < count <= last <= resolution:
+        raise ValueError(f"slabs {start} to {last} do not lie in a grid of {resolution}")
     channels, height, width = triplane.shape[1:]
     fraction = np.linspace(0.0, 1.0, resolution)
 
@@ -402,7 +406,7 @@ def density_grid(
         raw = model.decoder.after_first(xy_xz[0][:, None] + xy_xz[1][None] + yz)
         return _density(model, raw[..., 0])
 
-    return jax.lax.map(slab, planes[:2, start : start + count].transpose(1, 0, 2, 3))
+    return jax.lax.map(slab, jax.lax.dynamic_slice_in_dim(planes[:2], start, count, axis=1).transpose(1, 0, 2, 3))
 
 
 # --- the renderer -----------------------------------------------------------------------------------------------------
