@@ -219,9 +219,10 @@ def refusals():
     yield "no depth inside the box", (rgb, np.zeros_like(depth), None, K), {"box": (10, 10, 20, 20)}
     yield "looks like millimetres; pass depth_scale=0.001", (rgb, depth * 1000, mask, K), {}
     yield "looks like millimetres", (rgb, (depth * 1000).astype(np.uint16), mask, K), {}
-    yield "looks like tenths of a millimetre", (rgb, (depth * 1e4).astype(np.uint16), mask, K), {}
+    yield "looks like tenths of a millimetre", (rgb, (depth * 2e4).astype(np.uint16), mask, K), {}
     yield "looks like millimetres", (rgb, (depth * 1000).astype(np.uint16), mask, K), {"depth_scale": 1.0}
-    yield "pass depth_scale", (rgb, depth, mask, K), {"depth_scale": 1e-3}
+    yield "looks like metres; pass depth_scale=1", (rgb, depth, mask, K), {"depth_scale": 1e-3}
+    yield "pass depth_scale, the metres per", (rgb, depth * 1e-9, mask, K), {}
     yield "positive number", (rgb, depth, mask, K), {"depth_scale": -1.0}
     yield "singular", (rgb, depth, mask, singular), {}
     yield "not finite", (rgb, depth, mask, K * np.nan), {}
@@ -229,7 +230,7 @@ def refusals():
     yield "3 × 3", (rgb, depth, mask, np.eye(4)), {}
     yield "not finite", (np.full(rgb.shape, np.nan), depth, mask, K), {}
     yield "in \\[0, 1\\]", (rgb.astype(np.float32), depth, mask, K), {}
-    yield "height × width × 3", (rgb[0], depth, mask, K), {}
+    yield "height × width × 3", (rgb[None], depth, mask, K), {}
     yield "the camera is for images of 640", (rgb, depth, mask, Intrinsics(K, size=(640, 480))), {}
     yield "crop must be", (rgb, depth, mask, K), {"crop": "round"}
     yield "background must be", (rgb, depth, mask, K), {"background": "pink"}

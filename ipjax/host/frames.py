@@ -268,8 +268,14 @@ def _depth_scale(depth: np.ndarray, depth_scale: float | None, intrinsics: Intri
 
 def _unit_in_words(median: float, else_say: str, scale: float | None) -> str:
     # A hand-held or table-top scene is 0.1 to 10 m away.
-    units = ((1e-3, "millimetres"), (1e-4, "tenths of a millimetre"), (1e-2, "centimetres"), (1e-6, "micrometres"))
-    for unit, name in units:
+    units = {
+        1.0: "metres",
+        1e-3: "millimetres",
+        1e-4: "tenths of a millimetre",
+        1e-2: "centimetres",
+        1e-6: "micrometres",
+    }
+    for unit, name in units.items():
         if 0.1 <= median * unit <= 10:
             asked = f" with depth_scale={scale:g}" if scale not in (None, 1.0) else ""
             return f"median depth {median:.4g}{asked}: this looks like {name}; pass depth_scale={unit:g}"
