@@ -410,9 +410,9 @@ def _open(path: str | Path) -> Image.Image:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), path.open("rb") as file:
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(path)
+            image = Image.open(file)
             image.load()
     except UnidentifiedImageError:
         raise ValueError(f"{path}: not an image") from None
