@@ -702,7 +702,7 @@ def write_results(path: str | Path, rows: Iterable[ResultRow]) -> Path:
 def as_row(scene_id: int, im_id: int, estimate: Estimate, time: float = -1.0) -> ResultRow:
     """An estimate as a row: metres become millimetres. A scale other than 1 is lost (a BOP row has no place for it)."""
     rotation = np.asarray(estimate.rotation, np.float64).reshape(9)
-    translation = np.asarray(estimate.translation_m, np.float64).reshape(3) / MM
+    translation = np.asarray(estimate.translation_m, np.float64).reshape(3) * 1000
     return ResultRow(
         scene_id, im_id, estimate.obj_id, float(estimate.score), tuple(rotation), tuple(translation), float(time)
     )

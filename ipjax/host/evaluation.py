@@ -1102,6 +1102,7 @@ class Journal:
         self.done[image] = Done(rows, seconds, error)
 
     def _read(self, lines: list[str], head: Mapping[str, Any]) -> None:
+        differs: list[str] = []
         for number, line in enumerate(lines, start=1):
             try:
                 entry = json.loads(line)
@@ -1119,8 +1120,9 @@ class Journal:
                     f"{self.path}, line {number}: damaged ({error}); delete the line to redo it"
                 ) from None
             if number == 1 and differs:
+                what = ", ".join(differs)
                 raise DatasetError(
-                    f"{self.path}: these results were made with other settings ({', '.join(differs)}); choose another folder"
+                    f"{self.path}: these results were made with other settings ({what}); choose another folder"
                 )
 
     def _write(self, entry: Mapping[str, Any]) -> None:

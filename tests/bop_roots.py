@@ -1,0 +1,89 @@
+"""BOP data sets written from the golden numbers, for the tests of reading and scoring."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+GOLDEN = Path(__file__).resolve().parent / "golden"
+ERRORS = np.load(GOLDEN / "bop_pose_errors.npz")
+PROTOCOL = np.load(GOLDEN / "bop_protocol.npz")
+
+
+def write_models(root: Path) -> None:
+    """The four golden meshes as ``models_eval``."""
+    folder = root / "models_eval"
+    folder.mkdir(parents=True)
+    infos = {}
+    for number in (1, 2, 3, 4):
+        infos[str(number)] = json.loads(str(ERRORS[f"obj{number}_info_json"]))
+        points, faces = ERRORS[f"obj{number}_pts"], ERRORS[f"obj{number}_faces"]
+        head = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+        head += [f"property float {axis}" for axis in "xyz"]
+        head += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+        body = [" ".join(repr(float(x)) for x in p) for p in points] + [f"3 {a} {b} {c}" for a, b, c in faces]
+        (folder / f"obj_{number:06d}.ply").write_text("\n".join(head + body) + "\n")
+    (folder / "models_info.json").write_text(json.dumps(infos))
+
+
+def write_protocol(root: Path) -> Path:
+    """The golden protocol as a data set without images; ``camera.json`` says how large they are."""
+    write_models(root)
+    width, height = (int(x) for x in ERRORS["im_size_wh"])
+    (root / "camera.json").write_text(json.dumps({"width": width, "height": height}))
+    truths: dict = {}
+    infos: dict = {}
+    order = np.lexsort((PROTOCOL["gt_id"], PROTOCOL["gt_im"], PROTOCOL["gt_scene"]))
+    for i in order:
+        scene, image = int(PROTOCOL["gt_scene"][i]), str(PROTOCOL["gt_im"][i])
+        truths.setdefault(scene, {}).setdefault(image, []).append(
+            {
+                "obj_id": int(PROTOCOL["gt_obj"][i]),
+                "cam_R_m2c": PROTOCOL["gt_R"][i].astype(float).ravel().tolist(),
+                "cam_t_m2c": PROTOCOL["gt_t"][i].astype(float).ravel().tolist(),
+            }
+        )
+        infos.setdefault(scene, {}).setdefault(image, []).append({"visib_fract": float(PROTOCOL["gt_visib"][i])})
+    camera = {"cam_K": ERRORS["K"].ravel().tolist(), "depth_scale": 0.1}
+    for scene in truths:
+        folder = root / "test" / f"{scene:06d}"
+        folder.mkdir(parents=True)
+        (folder / "scene_gt.json").write_text(json.dumps(truths[scene]))
+        (folder / "scene_gt_info.json").write_text(json.dumps(infos[scene]))
+        (folder / "scene_camera.json").write_text(json.dumps(dict.fromkeys(truths[scene], camera)))
+    names = ("scene_id", "im_id", "obj_id", "inst_count")
+    targets = [dict(zip(names, row, strict=True)) for row in PROTOCOL["targets"].tolist()]
+    (root / "test_targets_bop19.json").write_text(json.dumps(targets))
+    return root
+
+
+def write_images(root: Path, scenes: int = 1, images: int = 4) -> Path:
+    """A small data set with images: object 2 and object 3 in each, 64 × 48 pixels, random colours, a flat depth."""
+    from PIL import Image
+
+    write_models(root)
+    random = np.random.default_rng(0)
+    targets = []
+    for scene in range(scenes):
+        folder = root / "test" / f"{scene:06d}"
+        for kind in ("rgb", "depth", "mask_visib"):
+            (folder / kind).mkdir(parents=True)
+        camera, truth = {}, {}
+        for image in range(images):
+            camera[str(image)] = {"cam_K": [100.0, 0, 32, 0, 100.0, 24, 0, 0, 1], "depth_scale": 0.5}
+            truth[str(image)] = []
+            for index, obj in enumerate((2, 3)):
+                turn = ERRORS["R_gt"][image * 2 + index].astype(float)
+                shift = [150.0 * index - 75, 10.0 * image, 700.0]
+                truth[str(image)].append({"obj_id": obj, "cam_R_m2c": turn.ravel().tolist(), "cam_t_m2c": shift})
+                mask = np.zeros((48, 64), np.uint8)
+                mask[14:34, 2 + 30 * index : 30 + 30 * index] = 255
+                Image.fromarray(mask).save(folder / "mask_visib" / f"{image:06d}_{index:06d}.png")
+                targets.append({"scene_id": scene, "im_id": image, "obj_id": obj, "inst_count": 1})
+            rgb = random.integers(0, 255, (48, 64, 3), np.uint8)
+            Image.fromarray(rgb).save(folder / "rgb" / f"{image:06d}.png")
+            Image.fromarray(np.full((48, 64), 1400, np.uint16)).save(folder / "depth" / f"{image:06d}.png")
+        (folder / "scene_camera.json").write_text(json.dumps(camera))
+        (folder / "scene_gt.json").write_text(json.dumps(truth))
+    (root / "test_targets_bop19.json").write_text(json.dumps(targets))
+    return root

@@ -1,0 +1,299 @@
+"""Scores equal BOP's, obey the protocol's laws, and a run that was killed ends with the same numbers."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bop_roots import ERRORS, PROTOCOL, write_images, write_protocol
+
+from ipjax.host import bop, evaluation
+from ipjax.host.bop import DatasetError, Estimate, ResultRow
+
+VSD = np.load(Path(__file__).resolve().parent / "golden" / "bop_vsd.npz")
+
+
+def protocol_rows() -> list[ResultRow]:
+    columns = [PROTOCOL[f"est_{name}"].tolist() for name in ("scene", "im", "obj", "score")]
+    places = zip(*columns, PROTOCOL["est_R"].astype(float), PROTOCOL["est_t"].astype(float), strict=True)
+    return [ResultRow(s, i, o, c, tuple(R.ravel()), tuple(t)) for s, i, o, c, R, t in places]
+
+
+def true_rows(dataset: bop.Dataset) -> list[ResultRow]:
+    rows = []
+    for (scene, image), targets in dataset.targets_by_image().items():
+        for truth in dataset.truths(scene, image):
+            if truth.obj_id in {t.obj_id for t in targets}:
+                estimate = Estimate(truth.obj_id, truth.visible, truth.rotation, truth.translation)
+                rows.append(bop.as_row(scene, image, estimate, 0.5))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def protocol(tmp_path_factory) -> bop.Dataset:
+    return bop.Dataset(write_protocol(tmp_path_factory.mktemp("bop") / "golden"))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory) -> bop.Dataset:
+    return bop.Dataset(write_images(tmp_path_factory.mktemp("bop") / "small"))
+
+
+@pytest.fixture(scope="module")
+def golden_score(protocol):
+    return evaluation.score(protocol_rows(), protocol, ("mssd", "mspd", "ap"), samples=200)
+
+
+def test_recalls_and_precisions_are_bops_exactly(golden_score):
+    found = golden_score
+    assert found.all_frames.targets == int(PROTOCOL["targets_count"])
+    for name in ("mssd", "mspd"):
+        np.testing.assert_allclose(found.curves[name], PROTOCOL[f"{name}_recall"], rtol=1e-12)
+        assert found.all_frames.recalls[name] == pytest.approx(float(PROTOCOL[f"AR_{name}"]), abs=1e-12)
+        assert found.precision[f"ap_{name}"] == pytest.approx(float(PROTOCOL[f"AP_{name}"]), abs=1e-12)
+    assert found.precision["map"] == pytest.approx(float(PROTOCOL["mAP_bop24"]), abs=1e-12)
+
+
+def test_recall_is_weighted_by_instances(golden_score):
+    counts = np.array([entry["targets"] for entry in golden_score.objects.values()])
+    recalls = np.array([entry["mssd"] for entry in golden_score.objects.values()])
+    assert golden_score.all_frames.recalls["mssd"] == pytest.approx((counts * recalls).sum() / counts.sum())
+    assert abs(recalls.mean() - golden_score.all_frames.recalls["mssd"]) > 1e-3  # so the test can tell them apart
+
+
+def test_intervals_hold_the_value_and_come_back(protocol, golden_score):
+    low, high = golden_score.all_frames.intervals["mssd"]
+    assert low < golden_score.all_frames.recalls["mssd"] < high
+    again = evaluation.score(protocol_rows(), protocol, ("mssd", "mspd"), samples=200)
+    assert again.all_frames.intervals["mssd"] == (low, high)
+
+
+def test_the_order_of_rows_does_not_matter(protocol, golden_score):
+    rows = protocol_rows()
+    shuffled = [rows[i] for i in np.random.default_rng(1).permutation(len(rows))]
+    again = evaluation.score(shuffled, protocol, ("mssd", "mspd", "ap"), samples=0)
+    assert again.all_frames.recalls == golden_score.all_frames.recalls
+    assert again.precision == golden_score.precision
+
+
+def test_the_truth_scores_one_on_every_metric(small):
+    names = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
+    found = evaluation.score(true_rows(small), small, names, scales=[1.0] * 8)
+    assert found.all_frames.recalls == {"mssd": 1.0, "mspd": 1.0, "vsd": 1.0, "ar": 1.0}
+    assert found.precision == {"ap_mssd": 1.0, "ap_mspd": 1.0, "map": 1.0}
+    assert set(found.add.values()) == {1.0}
+    assert found.medians == {"rotation_deg": 0.0, "translation_mm": 0.0, "scale_percent": 0.0}
+    assert (found.missing, found.seconds_per_image) == (0, 0.5)
+    assert json.loads(json.dumps(found.to_dict()))["all_frames"]["recalls"]["ar"] == 1.0
+    assert "AR_VSD" in found.table() and "one frame per scene" in found.table()
+
+
+def test_a_missing_estimate_is_a_miss(small):
+    rows = true_rows(small)
+    found = evaluation.score(rows[:-2], small, ("mssd", "mspd", "add"), samples=0)
+    assert found.all_frames.recalls["mssd"] == 6 / 8
+    assert found.missing == 2
+    assert found.add["recall_01d"] == 6 / 8
+    nothing = evaluation.score([], small, ("mssd", "vsd", "ap"), samples=0)
+    assert nothing.all_frames.recalls == {"mssd": 0.0, "vsd": 0.0}
+    assert nothing.precision["map"] == 0.0
+
+
+def test_symmetric_errors_in_the_medians(small):
+    turn = small.models()[3].symmetry_rotations[200]
+    rows = [
+        replace(r, rotation=tuple((np.reshape(r.rotation, (3, 3)) @ turn).ravel()))
+        for r in true_rows(small)
+        if r.obj_id == 3
+    ]
+    found = evaluation.score(rows, small, ("mssd", "mspd"), objects=[3], samples=0)
+    assert found.all_frames.recalls["mspd"] == 1.0
+    assert found.medians["rotation_deg"] < 1e-3
+
+
+def test_wins_against_a_second_file(small, tmp_path):
+    rows = true_rows(small)
+    worse = [replace(r, translation=(r.translation[0] + 15, *r.translation[1:])) if r.obj_id == 2 else r for r in rows]
+    path = bop.write_results(tmp_path / "other_small-test.csv", worse)
+    found = evaluation.score(rows, small, ("mssd", "mspd"), against=path, samples=0)
+    assert found.against is not None
+    assert (found.against["wins"], found.against["ties"], found.against["losses"]) == (1, 1, 0)
+    assert "Objects won against other_small-test" in found.table()
+
+
+def test_without_depth_there_is_no_vsd_and_the_table_says_so(protocol):
+    found = evaluation.score(protocol_rows(), protocol, samples=0)
+    assert "vsd" not in found.all_frames.recalls and "ar" not in found.all_frames.recalls
+    assert "scored without VSD" in found.table()
+
+
+def test_an_alignment_moves_the_mesh_and_is_named(small, tmp_path):
+    turn = ERRORS["R_gt"][5].astype(float)
+    path = tmp_path / "mesh_to_model.json"
+    path.write_text(json.dumps({"scale": 250.0, "R": turn.tolist(), "t": [3.0, -4.0, 5.0]}))
+    alignment = evaluation.read_alignment(path)
+    assert alignment.scale == 0.25
+    shift = np.array([0.003, -0.004, 0.005])
+    truth = small.truths(0, 0)[0]
+    # camera_from_mesh = camera_from_model ∘ model_from_mesh
+    of_mesh = Estimate(2, 1.0, truth.rotation @ turn, truth.rotation @ shift + truth.translation, 0.25)
+    moved = alignment.apply(of_mesh)
+    np.testing.assert_allclose(moved.rotation, truth.rotation, atol=1e-6)
+    np.testing.assert_allclose(moved.translation_m, truth.translation, atol=1e-7)
+    assert moved.scale == pytest.approx(1.0)
+    rows = [bop.as_row(0, 0, of_mesh)]
+    found = evaluation.score(rows, small, ("mssd",), objects=[2], alignments={2: alignment}, samples=0)
+    assert found.all_frames.recalls["mssd"] == 1 / 4
+    assert "mesh_to_model.json" in found.table()
+    path.write_text('{"scale": 1}')
+    with pytest.raises(DatasetError, match="an alignment is JSON"):
+        evaluation.read_alignment(path)
+
+
+def test_rows_of_things_that_do_not_exist(small, tmp_path):
+    rows = true_rows(small)
+    for bad, says in ((replace(rows[0], obj_id=77), "no object 77"), (replace(rows[0], im_id=500), "no image 500")):
+        path = bop.write_results(tmp_path / "x_small-test.csv", [rows[1], bad])
+        with pytest.raises(DatasetError, match=f"line 3: the data set has {says}"):
+            evaluation.score(path, small, ("mssd",))
+        found = evaluation.score(path, small, ("mssd",), on_error="skip", samples=0)
+        assert len(found.problems) == 1
+        assert found.all_frames.recalls["mssd"] == 1 / 8
+    with pytest.raises(ValueError, match="unknown metric"):
+        evaluation.score(rows, small, ("mssq",))
+
+
+def test_matching_is_greedy_strict_and_one_to_one():
+    table = np.array([[0.1, 0.3], [0.05, 0.5]])
+    np.testing.assert_array_equal(evaluation.match_poses(table, np.array([0.9, 0.8]), 0.4), [0, -1])
+    np.testing.assert_array_equal(evaluation.match_poses(table, np.array([0.8, 0.9]), 0.4), [1, 0])
+    np.testing.assert_array_equal(evaluation.match_poses(table, np.array([0.9, 0.8]), 0.1), [-1, 0])
+    valid = np.array([False, True])
+    np.testing.assert_array_equal(evaluation.match_poses(table, np.array([0.9, 0.8]), 0.4, valid), [1, -1])
+
+
+def test_average_precision_by_hand():
+    assert evaluation.average_precision(np.array([0.9, 0.8]), np.array([True, True]), 2) == 1.0
+    # Half of the truths, found first: precision 1 at the recalls 0 … 0.5 (51 of 101).
+    assert evaluation.average_precision(np.array([0.9, 0.8]), np.array([True, False]), 2) == pytest.approx(51 / 101)
+    assert evaluation.average_precision(np.array([]), np.array([]), 3) == 0.0
+
+
+def test_rendered_depth_follows_the_toolkits_pixels(small):
+    """The golden depth maps sample the surface at pixel + ½, as the toolkit's renderers do."""
+    rows = np.flatnonzero(VSD["obj_id"] == 2)[:3]
+    poses = [evaluation.Pose(VSD["R_gt"][i].astype(float), VSD["t_gt"][i].astype(float) / 1000) for i in rows]
+    cameras = np.repeat(VSD["K"][None], len(rows), 0)
+    golden = VSD["depth_gt"][rows]
+    apart = {}
+    for corner in (0.0, 0.5):
+        drawn = 1000 * evaluation.render_depths(small.mesh(2), poses, cameras, 96, 128, corner=corner)
+        both = (drawn > 0) & (golden > 0)
+        apart[corner] = np.abs(drawn - golden)[both].mean()
+        if corner == 0.5:
+            assert ((drawn > 0) != (golden > 0)).sum() <= 3  # of some thousand
+    assert apart[0.5] < 0.05  # mm; the golden depths are rounded to 1/16 mm
+    assert apart[0.0] > 2 * apart[0.5]
+
+
+# Resuming
+
+
+class Noisy:
+    """Estimates from the truth, deterministic per image; counts its calls, and dies after a few."""
+
+    def __init__(self, dataset, calls=None, die_after=None):
+        self.dataset, self.calls, self.die_after = dataset, [] if calls is None else calls, die_after
+
+    def __call__(self, frame, targets):
+        if self.die_after is not None and len(self.calls) >= self.die_after:
+            raise KeyboardInterrupt
+        self.calls.append((frame.scene_id, frame.im_id))
+        random = np.random.default_rng(frame.im_id)
+        truths = {t.obj_id: t for t in self.dataset.truths(frame.scene_id, frame.im_id)}
+        return [
+            Estimate(
+                t.obj_id, 0.5, truths[t.obj_id].rotation, truths[t.obj_id].translation + random.normal(0, 0.01, 3), 1.1
+            )
+            for t in targets
+        ]
+
+
+def poses_of(folder: Path) -> list[str]:
+    return [line.rsplit(",", 1)[0] for line in (folder / "test_small-test.csv").read_text().splitlines()]
+
+
+def run(small, folder, estimator, **settings):
+    return evaluation.evaluate(
+        small, None, estimator, folder, method="test", progress=False, metrics=("mssd", "mspd"), **settings
+    )
+
+
+def test_a_killed_run_ends_with_the_same_numbers(small, tmp_path):
+    whole = run(small, tmp_path / "whole", Noisy(small))
+    assert whole.medians["scale_percent"] == pytest.approx(10.0)
+    calls: list = []
+    for stop in (1, 3):
+        with pytest.raises(KeyboardInterrupt):
+            run(small, tmp_path / "parts", Noisy(small, calls, die_after=stop))
+        with open(tmp_path / "parts" / "results.jsonl", "a") as file:
+            file.write('{"image": [0, ')  # what a crash in the middle of a write leaves
+    resumed = run(small, tmp_path / "parts", Noisy(small, calls))
+    assert calls == [(0, 0), (0, 1), (0, 2), (0, 3)]  # each once
+    assert resumed.all_frames == whole.all_frames
+    assert poses_of(tmp_path / "parts") == poses_of(tmp_path / "whole")
+    again = run(small, tmp_path / "parts", Noisy(small, calls))
+    assert len(calls) == 4
+    assert again.seconds_per_image == resumed.seconds_per_image
+    assert json.loads((tmp_path / "parts" / "score.json").read_text())["missing"] == 0
+
+
+def test_results_of_other_settings_are_refused(small, tmp_path):
+    run(small, tmp_path, Noisy(small), settings={"resolution": 224})
+    with pytest.raises(DatasetError, match="other settings"):
+        run(small, tmp_path, Noisy(small), settings={"resolution": 448})
+
+
+def test_a_failure_stops_or_counts_as_a_miss(small, tmp_path):
+    good = Noisy(small)
+
+    def fails(frame, targets):
+        if frame.im_id == 1:
+            raise RuntimeError("no pose today")
+        if frame.im_id == 2:
+            return [Estimate(2, 1.0, np.full((3, 3), np.nan), np.zeros(3))]
+        return good(frame, targets)
+
+    with pytest.raises(RuntimeError, match="no pose today"):
+        run(small, tmp_path / "a", fails)
+    found = run(small, tmp_path / "b", fails, on_error="skip")
+    assert found.missing == 4
+    assert "2 images failed and count as misses" in found.table() and "no pose today" in found.table()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no file locks of this kind")
+def test_one_run_at_a_time(small, tmp_path):
+    script = (
+        "import fcntl, sys, time\n"
+        "f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print('held', flush=True); time.sleep(60)\n"
+    )
+    command = [sys.executable, "-c", script, os.fspath(tmp_path / ".lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        try:
+            assert holder.stdout is not None and holder.stdout.readline().strip() == "held"
+            with pytest.raises(DatasetError, match="another run is writing here"):
+                run(small, tmp_path, Noisy(small))
+        finally:
+            holder.kill()
+
+
+def test_the_truth_of_the_mini_set_scores_one(shared):
+    dataset = bop.Dataset(shared / "data" / "ycbv")
+    rows = true_rows(dataset)
+    found = evaluation.score(rows, dataset, ("mssd", "mspd", "add_s"), objects=[14, 18], samples=50)
+    assert found.all_frames.recalls == {"mssd": 1.0, "mspd": 1.0}
+    assert found.add["add_or_s_auc"] == 1.0
