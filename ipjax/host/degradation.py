@@ -116,7 +116,7 @@ class _Welded:
 
     place: np.ndarray  # of every vertex
     vertices: np.ndarray  # one per place
-    average: sparse.csr_matrix  # mean over the neighbours of every place
+    average: sparse.csr_array  # mean over the neighbours of every place
 
 
 def _weld(mesh: Mesh) -> _Welded:
@@ -130,7 +130,7 @@ def _weld(mesh: Mesh) -> _Welded:
     a = np.concatenate([corners[:, [0, 1, 2]].ravel(), corners[:, [1, 2, 0]].ravel()])
     b = np.concatenate([corners[:, [1, 2, 0]].ravel(), corners[:, [0, 1, 2]].ravel()])
     proper = a != b
-    links = sparse.coo_matrix((np.ones(int(proper.sum())), (a[proper], b[proper])), (count, count)).tocsr()
+    links = sparse.coo_array((np.ones(int(proper.sum())), (a[proper], b[proper])), (count, count)).tocsr()
     links.data[:] = 1
     degree = np.asarray(links.sum(1)).reshape(-1)
     lonely = sparse.diags_array((degree == 0).astype(np.float64))

@@ -99,8 +99,10 @@ def make_mesh(
     else:
         uv = texture = None
     if colours is None:
-        plain = texture is None or uv is None
-        colours = np.full((n, 3), GREY, np.uint8) if plain else sample_texture(texture, uv)
+        if texture is not None and uv is not None:
+            colours = sample_texture(texture, uv)
+        else:
+            colours = np.full((n, 3), GREY, np.uint8)
     colours = _as_bytes(colours)[:, :3]
     if colours.shape != (n, 3):
         raise ValueError(f"colours must be [{n} 3], got {list(colours.shape)}")
@@ -471,6 +473,9 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     """
     import trimesh
     from PIL import Image
+    from trimesh.exchange.obj import export_obj
+    from trimesh.visual import ColorVisuals, TextureVisuals
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     path = Path(path)
     kind = path.suffix.lower()
@@ -479,22 +484,20 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
     out = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
     if mesh.texture is not None and mesh.uv is not None and kind in (".glb", ".obj"):
         image = Image.fromarray(mesh.texture)
-        material = trimesh.visual.material.PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+        material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
         if kind == ".obj":
-            material = trimesh.visual.material.SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
-        out.visual = trimesh.visual.TextureVisuals(uv=mesh.uv, material=material)
+            material = SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
+        out.visual = TextureVisuals(uv=mesh.uv, material=material)
     else:
-        out.visual = trimesh.visual.ColorVisuals(out, vertex_colors=mesh.colours)
+        out.visual = ColorVisuals(out, vertex_colors=mesh.colours)
     if kind == ".obj":
-        text, files = trimesh.exchange.obj.export_obj(
-            out, include_normals=True, return_texture=True, mtl_name=path.stem + ".mtl"
-        )
+        text, files = export_obj(out, include_normals=True, return_texture=True, mtl_name=path.stem + ".mtl")
         for name, data in files.items():
             (path.parent / name).write_bytes(data)
         path.write_text(text)
         return
-    options = {"vertex_normal": True} if kind == ".ply" else {}
-    path.write_bytes(out.export(file_type=kind[1:], **options))
+    data = out.export(file_type=kind[1:])
+    path.write_bytes(data if isinstance(data, bytes) else str(data).encode())
 
 
 # --- repairing -----------------------------------------------------------------------------------------------------
@@ -522,14 +525,14 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     area = np.linalg.norm(_corner_products(mesh.vertices, faces), axis=-1) / 2
     flat = (area <= 1e-14 * longest**2) | (corners[:, [0, 1, 2]] == corners[:, [1, 2, 0]]).any(1)
     if flat.any():
-        report.append(f"removed {int(flat.sum())} faces without area")
+        report.append(f"removed {_count(flat.sum(), 'face')} without area")
         faces, corners, area = faces[~flat], corners[~flat], area[~flat]
     if len(faces) == 0:
         raise ValueError("no face of the mesh has an area")
     fresh = np.zeros(len(faces), bool)
     fresh[np.unique(np.sort(corners, axis=1), axis=0, return_index=True)[1]] = True
     if not fresh.all():
-        report.append(f"removed {int((~fresh).sum())} faces that were there twice")
+        report.append(f"removed {_count((~fresh).sum(), 'repeated face')}")
         faces, corners, area = faces[fresh], corners[fresh], area[fresh]
 
     # Flecks.
@@ -554,7 +557,7 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
         report.append(f"turned {int(flipped.sum())} of {len(faces)} faces outwards")
         faces = np.where(flipped[:, None], faces[:, ::-1], faces)
     if not closed:
-        report.append("the surface has holes")
+        report.append("the surface is not closed")
 
     # Vertices.
     if mesh.texture is not None and mesh.uv is not None:
@@ -570,10 +573,10 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     faces = new.reshape(-1, 3).astype(np.int32)
     merged = len(np.unique(number)) - len(mesh.vertices)
     if merged:
-        report.append(f"merged {-merged} duplicate vertices")
+        report.append(f"merged {_count(-merged, 'duplicate vertex', 'duplicate vertices')}")
     loose = len(np.unique(number)) - len(used)
     if loose:
-        report.append(f"removed {loose} vertices that no face uses")
+        report.append(f"removed {_count(loose, 'unused vertex', 'unused vertices')}")
     vertices = mesh.vertices[pick]
     result = dataclasses.replace(
         mesh,
@@ -585,6 +588,10 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
         uv=None if mesh.uv is None else mesh.uv[pick],
     )
     return result, tuple(report) or ("nothing to repair",)
+
+
+def _count(number: int, noun: str, plural: str = "") -> str:
+    return f"{int(number)} {noun if number == 1 else plural or noun + 's'}"
 
 
 def _pieces(corners: np.ndarray, count: int) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Z-buffers of points and of triangles, in bounded memory and without shapes that depend on the data.
 
-Pixel centres are integers: pixel (column, row) looks along ((column − centre_x) / focal_x, (row − centre_y) / focal_y, 1).
+Pixel centres are integers: pixel (column, row) looks along
+((column − centre_x) / focal_x, (row − centre_y) / focal_y, 1).
 Depth is along z in the units of the points, and 0 where nothing is.
 """
 
@@ -82,10 +83,10 @@ def rasterize(
     last = jnp.clip(high, -1, limit).astype(jnp.int32)
     squares = jnp.maximum(last - first + tile, 0) // tile  # m 2: columns, rows
     drawn = jnp.all(usable[faces], axis=1)
-    ends = jnp.cumsum(jnp.where(drawn, squares[:, 0] * squares[:, 1], 0))
+    ends = jnp.cumsum(jnp.where(drawn, squares[:, 0] * squares[:, 1], 0), dtype=jnp.int32)
     inverse = jnp.where(usable, 1 / safe, 1)[faces]  # m 3
 
-    offset = jnp.arange(tile)
+    offset = jnp.arange(tile, dtype=jnp.int32)
     offset_x, offset_y = jnp.tile(offset, tile), jnp.repeat(offset, tile)
     nobody = jnp.asarray(faces.shape[0], jnp.int32)
     empty = (
@@ -99,7 +100,7 @@ def rasterize(
 
     def draw(state):
         start, nearest, owner = state
-        square = start + jnp.arange(block)
+        square = start + jnp.arange(block, dtype=jnp.int32)
         face = jnp.minimum(jnp.searchsorted(ends, square, side="right"), nobody - 1).astype(jnp.int32)
         count = squares[face]
         rest = square - (ends[face] - count[:, 0] * count[:, 1])
@@ -125,7 +126,7 @@ def rasterize(
         _, nearest, owner = lax.while_loop(unfinished, draw, empty)
     seen = owner < nobody
     face = jnp.where(seen, owner, 0)
-    row, column = jnp.divmod(jnp.arange(height * width), width)
+    row, column = jnp.divmod(jnp.arange(height * width, dtype=jnp.int32), width)
     if faces.shape[0] == 0:
         weights = jnp.zeros((height * width, 3), screen.dtype)
     else:
