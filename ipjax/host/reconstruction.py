@@ -163,14 +163,14 @@ def reconstruct_with_triposr(
     size = square.shape[0]
     focal = 0.5 * size / np.tan(np.deg2rad(0.5 * _FOV))
     camera = Camera(
-        focal=np.full(2, focal, np.float32),  # type: ignore[arg-type]
-        centre=np.array([x + (size - 1) / 2, y + (size - 1) / 2], np.float32),  # type: ignore[arg-type]
+        focal=jnp.full(2, focal, jnp.float32),
+        centre=jnp.asarray([x + (size - 1) / 2, y + (size - 1) / 2], jnp.float32),
     )
     pose = Similarity(
         # Mesh: +x to the camera, +y to the image's right, +z up. Camera: x right, y down, z ahead.
-        rotation=np.array([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], np.float32),  # type: ignore[arg-type]
-        translation=np.array([0, 0, _DISTANCE], np.float32),  # type: ignore[arg-type]
-        scale=np.float32(1.0),  # type: ignore[arg-type]
+        rotation=jnp.asarray([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], jnp.float32),
+        translation=jnp.asarray([0, 0, _DISTANCE], jnp.float32),
+        scale=jnp.float32(1.0),
     )
     seen = _facing(mesh, np.array([_DISTANCE, 0.0, 0.0]))
     report = (
