@@ -49,8 +49,9 @@ def test_points_of_the_crop_lie_where_the_frame_saw_them(crop, left, top, width,
     seen = np.asarray(view.depth) > 0
     points = lift(view)[seen] @ np.asarray(camera_from_crop.rotation, np.float64).T
     assert len(points) > 20
-    # Nearest neighbours: a crop pixel takes the depth of a source pixel up to half a source pixel away.
-    slack = 0.8 / 100 * 0.25 + 1e-5
+    # Nearest neighbours: a crop pixel takes the depth of a source pixel up to half a source pixel away on either axis,
+    # 4 mm here, on a plane that leans by 13° and is seen up to 30° from the axis.
+    slack = 2.5e-3
     distance = np.abs(points @ [0.1, -0.2, 1.0] - 0.8) / np.linalg.norm([0.1, -0.2, 1.0])
     assert distance.max() < slack
     pixels = points[:, :2] / points[:, 2:] * K[[0, 1], [0, 1]] + K[:2, 2]
