@@ -55,7 +55,10 @@ def draw_minimal_sets(
         # Step over the intervals already drawn, in order of their place.
         for index in _sort_network(drawn):
             place = place + jnp.where(place >= ends[index] - shares[index], shares[index], 0)
-        drawn.append(jnp.sum(ends[None, :] <= place[:, None], axis=1, dtype=jnp.int32))
+        # A loop of ten gathers: comparing with every end costs more, and unrolled,
+        # or without the barrier, the compiler fuses it with all that follows for minutes.
+        index = jnp.searchsorted(ends, place, side="right").astype(jnp.int32)
+        drawn.append(jax.lax.optimization_barrier(index))
     # Nothing left to draw (place past the end): repeat the first index of the set, or 0.
     first = jnp.where(drawn[0] < weight.shape[0], drawn[0], 0)
     drawn = [jnp.where(index < weight.shape[0], index, first) for index in drawn]
@@ -169,9 +172,11 @@ def consensus(
         success = success & (spread_found >= spread) & jnp.all(weight[table] > 0, axis=1)
         success = success & _edges_agree(chosen_source, chosen_target, edge_ratio)
         rotation, translation = jnp.moveaxis(rotation, -1, 0), jnp.moveaxis(translation, -1, 0)
+        rotation, translation, scale, success = jax.lax.optimization_barrier((rotation, translation, scale, success))
     with jax.named_scope("judge"):
         score, loss, _, success = judge(rotation, translation, scale, success)
-        order = _order(score, loss)[:keep]
+        # A full sort costs six times as much; only "count" needs its second key.
+        order = jax.lax.top_k(score, keep)[1] if rank == "msac" else _order(score, loss)[:keep]
         best = (rotation[order], translation[order], scale[order], score[order], loss[order], success[order])
 
     def refit(_, best):

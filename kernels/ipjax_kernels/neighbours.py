@@ -40,8 +40,8 @@ def nearest(
     invalid patch is never matched; ties go to the lowest index. A patch that is itself invalid, or that faces nothing
     valid, has index 0 and similarity ``NO_MATCH`` = -2.
 
-    ``memory_bytes`` bounds the temporary arrays that grow with the number of patches: several templates are taken at
-    once, or a template is taken in parts, so that their similarities fit. Under ``vmap`` the queries follow one another
+    ``memory_bytes`` bounds the similarities in memory: a CPU takes one template at a time, an accelerator as many as
+    fit, and a template that does not fit is taken in parts. Under ``vmap`` the queries follow one another
     and share that memory. ``dtype`` is what the features are rounded to before the product, template by template;
     sums are float32 always. ``implementation``: "xla" runs anywhere and can be exported; "pallas" is one fused kernel
     on CUDA devices, which keeps similarities out of memory altogether, and "xla" elsewhere.
@@ -118,19 +118,38 @@ def _blank_missing(found, query_valid, template_valid):
 
 
 def _search_blocks(query, templates, query_valid, template_valid, *, memory_bytes, dtype):
+    views, others, _ = templates.shape
+    row_bytes = 2 * 4 * query.shape[0]  # the similarities, and room for their masked copy
+    if row_bytes > memory_bytes:
+        raise ValueError(f"nearest needs memory_bytes >= {row_bytes} for {query.shape[0]} patches; got {memory_bytes}")
+    rows = min(others, memory_bytes // row_bytes)
+    together = min(views, memory_bytes // (row_bytes * others))
+
+    def search_singly(query, templates, query_valid, template_valid):
+        step = partial(_search_template, query, query_valid, rows=rows)
+        return jax.lax.map(lambda template: step(*template), (templates, template_valid))
+
+    def search_together(query, templates, query_valid, template_valid):
+        step = partial(_search_template, query, query_valid, rows=rows)
+        return jax.lax.map(lambda template: step(*template), (templates, template_valid), batch_size=together)
+
     @jax.custom_batching.sequential_vmap
     def search(query, templates, query_valid, template_valid):
-        query = query.astype(dtype)
-        step = partial(_search_template, query, query_valid, memory_bytes=memory_bytes)
-        return tuple(jax.lax.map(lambda template: step(*template), (templates, template_valid)))
+        if templates.dtype == jnp.bfloat16:
+            # As plain bits: the CPU compiler would widen all templates at once, before the loop.
+            templates = jax.lax.bitcast_convert_type(templates, jnp.uint16)
+        arguments = query.astype(dtype), templates, query_valid, template_valid
+        if together < 2:
+            return tuple(search_singly(*arguments))
+        # One template's similarities stay in a CPU's cache; an accelerator wants more work at a time.
+        return tuple(jax.lax.platform_dependent(*arguments, cpu=search_singly, default=search_together))
 
     return search(query, templates, query_valid, template_valid)
 
 
-def _search_template(query, query_valid, template, template_valid, *, memory_bytes):
+def _search_template(query, query_valid, template, template_valid, *, rows):
     patches, others = query.shape[0], template.shape[0]
-    rows = max(1, memory_bytes // (4 * patches))
-    if rows >= others:
+    if rows == others:
         return _search_block(query, query_valid, template, template_valid)
     # Even parts; the last one is padded with invalid patches.
     parts = math.ceil(others / rows)
@@ -154,6 +173,8 @@ def _search_template(query, query_valid, template, template_valid, *, memory_byt
 
 
 def _search_block(query, query_valid, template, template_valid):
+    if template.dtype == jnp.uint16:
+        template = jax.lax.bitcast_convert_type(template, jnp.bfloat16)
     similarity = jax.lax.dot_general(
         query,
         template.astype(query.dtype),

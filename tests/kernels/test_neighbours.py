@@ -1,0 +1,234 @@
+"""Nearest neighbours: golden files, the slow twin, laws, the bound on memory, the fused kernel."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ipjax_kernels import reference
+from ipjax_kernels.neighbours import NO_MATCH, cycle_distance, nearest
+from ipjax_kernels.neighbours_pallas import search
+from jaxtyping import config as jaxtyping_config
+
+VIEWS, PATCHES, OTHERS, CHANNELS = 3, 20, 17, 8
+SMALL = 4 * 2 * PATCHES * 5  # room for five template patches: four parts, the last one padded
+
+
+@pytest.fixture
+def unchecked_shapes():
+    """Our own messages: the shape checker would speak first."""
+    jaxtyping_config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping_config.update("jaxtyping_disable", False)
+
+
+def lattice(seed, unique=False):
+    """Small integers: products are exact in every order of summation, and ties abound."""
+    rng = np.random.default_rng(seed)
+    high = 100 if unique else 2
+    query = rng.integers(-high, high + 1, (PATCHES, CHANNELS)).astype(np.float32)
+    templates = rng.integers(-high, high + 1, (VIEWS, OTHERS, CHANNELS)).astype(np.float32)
+    return tuple(
+        jnp.asarray(x) for x in (query, templates, rng.random(PATCHES) < 0.7, rng.random((VIEWS, OTHERS)) < 0.7)
+    )
+
+
+def assert_equal(ours, theirs):
+    for mine, other in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(mine, other)
+
+
+def load(path):
+    with np.load(path, allow_pickle=False) as file:
+        data = dict(file)
+    height, width, channels = data["feat_q"].shape
+
+    def unit(features):
+        features = features.reshape(*features.shape[:-3], -1, channels)
+        return jnp.asarray(features / np.linalg.norm(features, axis=-1, keepdims=True))
+
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    grid = jnp.asarray(np.stack([columns, rows], axis=-1).reshape(-1, 2).astype(np.float32))
+    return data, unit, grid
+
+
+def check_pair(path, memory_bytes):
+    data, unit, grid = load(path)
+    query, template = unit(data["feat_q"]), unit(data["feat_r"])[None]
+    mask_q, mask_r = data["mask_q"].reshape(-1), data["mask_r"].reshape(-1)
+    everywhere = jnp.ones(len(query), bool), jnp.ones((1, template.shape[1]), bool)
+    found = nearest(query, template, *everywhere, memory_bytes=memory_bytes)
+    np.testing.assert_array_equal(found.query_to_template[0], data["spec_nn_qr"])
+    np.testing.assert_array_equal(found.template_to_query[0], data["spec_nn_rq"])
+    np.testing.assert_allclose(found.query_similarity[0], data["ref_sim_qr"], atol=2e-6)
+    np.testing.assert_allclose(found.template_similarity[0], data["ref_sim_rq"], atol=2e-6)
+    cycle = cycle_distance(
+        found.query_to_template[0], found.template_to_query[0], grid, everywhere[0], everywhere[1][0]
+    )
+    np.testing.assert_allclose(cycle, data["spec_cyc_dist"].reshape(-1), atol=1e-6)
+
+    masked = nearest(query, template, jnp.asarray(mask_q), jnp.asarray(mask_r)[None], memory_bytes=memory_bytes)
+    np.testing.assert_array_equal(masked.query_to_template[0][mask_q], data["spec_masked_nn_qr"][mask_q])
+    np.testing.assert_array_equal(masked.template_to_query[0][mask_r], data["spec_masked_nn_rq"][mask_r])
+    cycle = cycle_distance(
+        masked.query_to_template[0], masked.template_to_query[0], grid, jnp.asarray(mask_q), jnp.asarray(mask_r)
+    )
+    np.testing.assert_allclose(cycle, data["spec_masked_cyc_dist"].reshape(-1), atol=1e-6)
+
+
+@pytest.mark.parametrize("memory_bytes", [64 * 2**20, 2 * 4 * 256 * 100])
+@pytest.mark.parametrize("name", ["zsp_pair16", "zsp_rand16"])
+def test_golden(name, memory_bytes, request):
+    check_pair(request.path.parents[1] / "golden" / f"{name}.npz", memory_bytes)
+
+
+@pytest.mark.parametrize("name", ["zsp_pair32", "zsp_pair37x28"])
+def test_golden_larger(name, shared):
+    check_pair(shared / "golden" / f"{name}.npz", 64 * 2**20)
+
+
+@pytest.mark.parametrize("name", ["zsp_views16", "zsp_views16_inplane"])
+def test_golden_views(name, shared):
+    data, unit, grid = load(shared / "golden" / f"{name}.npz")
+    mask_q, mask_t = jnp.asarray(data["mask_q"].reshape(-1)), jnp.asarray(data["mask_t"].reshape(16, -1))
+    found = nearest(unit(data["feat_q"]), unit(data["feat_t"]), mask_q, mask_t)
+    inside = np.asarray(mask_q)
+    np.testing.assert_array_equal(found.query_to_template[:, inside], data["spec_masked_nn_qr"][:, inside])
+    cycle = jax.vmap(cycle_distance, in_axes=(0, 0, None, None, 0))(
+        found.query_to_template, found.template_to_query, grid, mask_q, mask_t
+    )
+    np.testing.assert_allclose(cycle, data["spec_masked_cyc_dist"].reshape(16, -1), atol=1e-6)
+
+
+@given(seed=st.integers(0, 2**31), unique=st.booleans())
+def test_twin_with_ties_and_masks(seed, unique):
+    arguments = lattice(seed, unique)
+    expected = reference.nearest(*arguments)
+    assert_equal(nearest(*arguments), expected)
+    assert_equal(nearest(*arguments, memory_bytes=SMALL), expected)
+    query_valid, template_valid = (np.asarray(x) for x in arguments[2:])
+    found = nearest(*arguments)
+    assert np.all(query_valid[np.asarray(found.template_to_query)][template_valid])
+    grid = jnp.asarray(np.random.default_rng(seed).normal(size=(PATCHES, 2)).astype(np.float32))
+    for view in range(VIEWS):
+        forth, back = found.query_to_template[view], found.template_to_query[view]
+        cycle = cycle_distance(forth, back, grid, arguments[2], arguments[3][view])
+        twin = reference.cycle_distance(
+            np.asarray(forth), np.asarray(back), np.asarray(grid), query_valid, template_valid[view]
+        )
+        np.testing.assert_allclose(cycle, twin, atol=1e-5)
+
+
+@given(seed=st.integers(0, 2**31))
+def test_views_permute_and_queries_batch(seed):
+    query, templates, query_valid, template_valid = lattice(seed)
+    order = np.random.default_rng(seed).permutation(VIEWS)
+    found = nearest(query, templates, query_valid, template_valid)
+    assert_equal(nearest(query, templates[order], query_valid, template_valid[order]), (x[order] for x in found))
+    queries, flags = jnp.stack([query, query[::-1]]), jnp.stack([query_valid, query_valid[::-1]])
+    batched = jax.vmap(nearest, in_axes=(0, None, 0, None))(queries, templates, flags, template_valid)
+    assert_equal((x[0] for x in batched), found)
+    assert_equal((x[1] for x in batched), nearest(queries[1], templates, flags[1], template_valid))
+
+
+def test_eager_equals_jit():
+    arguments = lattice(7)
+    with jax.disable_jit():
+        eager = nearest(*arguments, memory_bytes=SMALL)
+    assert_equal(eager, nearest(*arguments, memory_bytes=SMALL))
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_narrow_storage_and_products(dtype):
+    query, templates, *flags = lattice(3)  # small integers are exact in every dtype
+    expected = nearest(query, templates, *flags)
+    assert_equal(nearest(query.astype(dtype), templates.astype(dtype), *flags), expected)
+    assert_equal(nearest(query.astype(dtype), templates.astype(dtype), *flags, dtype="bfloat16"), expected)
+
+
+def test_nothing_valid():
+    query, templates, query_valid, template_valid = lattice(0)
+    found = nearest(query, templates, jnp.zeros_like(query_valid), template_valid)
+    for index, similarity in (found[:2], found[2:]):
+        assert not np.any(index)
+        assert np.all(similarity == NO_MATCH)
+    empty = nearest(query, templates, query_valid, template_valid.at[1].set(False))
+    assert np.all(empty.query_similarity[1] == NO_MATCH)
+    cycle = cycle_distance(
+        empty.query_to_template[1],
+        empty.template_to_query[1],
+        jnp.zeros((PATCHES, 2)),
+        query_valid,
+        jnp.zeros(OTHERS, bool),
+    )
+    assert np.all(np.isinf(cycle))
+
+
+@given(seed=st.integers(0, 2**31))
+def test_fused_kernel_equals_twin(seed):
+    query, templates, query_valid, template_valid = lattice(seed)
+    expected = reference.nearest(query, templates, query_valid, template_valid)
+    found = FUSED(query, templates, query_valid, template_valid)
+    mine, theirs = np.asarray(query_valid), np.asarray(template_valid)
+    matched = mine & np.any(theirs, axis=1, keepdims=True)
+    for ours, wanted in zip(found[:2], expected[:2], strict=True):
+        np.testing.assert_array_equal(np.asarray(ours)[matched], wanted[matched])
+    for ours, wanted in zip(found[2:], expected[2:], strict=True):
+        if mine.any():
+            np.testing.assert_array_equal(np.asarray(ours)[theirs], wanted[theirs])
+
+
+FUSED = jax.jit(lambda *a: search(*a, block=16, interpret=True))  # two blocks each way, the last ones padded
+
+
+def test_fused_kernel_lowers_for_cuda_and_falls_back():
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lattice(0))
+    for dtype in ("float32", "bfloat16"):
+        traced = jax.jit(lambda *a, dtype=dtype: nearest(*a, dtype=dtype, implementation="pallas")).trace(*shapes)
+        assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
+        assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
+    assert_equal(nearest(*lattice(1), implementation="pallas"), nearest(*lattice(1)))
+
+
+@pytest.mark.parametrize(("patches", "memory_bytes"), [(256, 64 * 2**20), (900, 64 * 2**20), (900, 2**20)])
+def test_temporary_memory_is_bounded(patches, memory_bytes):
+    # Besides the similarities: the query, one template and what is returned, a few times over; views enter nowhere.
+    def shapes(views, *batch):
+        return (
+            jax.ShapeDtypeStruct((*batch, patches, 384), jnp.float32),
+            jax.ShapeDtypeStruct((views, patches, 384), jnp.float32),
+            jax.ShapeDtypeStruct((*batch, patches), bool),
+            jax.ShapeDtypeStruct((views, patches), bool),
+        )
+
+    one = jax.jit(lambda *a: nearest(*a, memory_bytes=memory_bytes)).lower(*shapes(40)).compile().memory_analysis()
+    allowed = min(memory_bytes, 8 * patches**2) + 4 * 4 * patches * 384 + 2 * 40 * 16 * patches
+    assert one.temp_size_in_bytes <= allowed
+    if patches == 900:
+        assert one.temp_size_in_bytes + one.output_size_in_bytes < 200e6
+    batch = jax.jit(jax.vmap(lambda *a: nearest(*a, memory_bytes=memory_bytes), in_axes=(0, None, 0, None)))
+    eight = batch.lower(*shapes(40, 8)).compile().memory_analysis()
+    assert eight.temp_size_in_bytes <= allowed + 8 * (4 * patches * 384 + 2 * 40 * 16 * patches)
+
+
+def test_no_callback_and_exportable():
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lattice(0))
+    exported = jax.export.export(jax.jit(lambda *a: tuple(nearest(*a))), platforms=("cpu", "cuda", "tpu"))(*shapes)
+    assert "callback" not in exported.mlir_module()
+    restored = jax.export.deserialize(exported.serialize())
+    assert_equal(restored.call(*lattice(5)), nearest(*lattice(5)))
+
+
+def test_refuses_wrong_shapes_in_words(unchecked_shapes):
+    query, templates, query_valid, template_valid = lattice(0)
+    with pytest.raises(ValueError, match="same c"):
+        nearest(query[:, :-1], templates, query_valid, template_valid)
+    with pytest.raises(ValueError, match="one flag per patch"):
+        nearest(query, templates, query_valid[:-1], template_valid)
+    with pytest.raises(ValueError, match="at least one"):
+        nearest(query, templates[:0], query_valid, template_valid[:0])
+    with pytest.raises(ValueError, match="memory_bytes"):
+        nearest(query, templates, query_valid, template_valid, memory_bytes=10)
+    with pytest.raises(ValueError, match="cycle_distance needs"):
+        cycle_distance(jnp.zeros(4, int), jnp.zeros(5, int), jnp.zeros((3, 2)), jnp.ones(4, bool), jnp.ones(5, bool))
