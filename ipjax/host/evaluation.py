@@ -673,7 +673,7 @@ class _Job:
                 there = [t for t in truths if t.obj_id == obj]
                 valid = np.array([t.visible < 0 or t.visible >= VISIBLE for t in there], bool)
                 counts[obj] += int(valid.sum())
-                if mine:
+                if mine and there:  # the toolkit drops estimates of objects that are not in the image at all
                     row = TargetRow(scene, image, obj, len(there))
                     slots[obj].append(_Slot(row, camera, width, there, valid, mine, [math.nan] * len(mine)))
         table = {"mssd": [], "mspd": []}
