@@ -24,6 +24,7 @@ class MatchConfig(eqx.Module):
     """From patches to pairs (Eq. 1–5)."""
 
     ranking: Literal["cyclic", "cosine"] = _static("cosine")  # views by Eq. 5, or by the cosines of short cycles
+    centred: bool = _static(True)  # compare features without the object's mean feature; the paper does not
     views: int = _static(8)  # templates whose pairs are kept
     pairs: int = _static(256)  # most pairs of each (the paper's K)
     cycle: float = 1.5  # longest cycle of a pair, patches; inf in the paper
@@ -57,7 +58,10 @@ class ScoreConfig(eqx.Module):
 
     ranking: Literal["inliers", "render"] = _static("render")
     resolution: int = _static(56)  # pixels on a side of the depth comparison
-    tolerance: float = 0.03  # depth difference that still agrees, in diameters
+    views: int = _static(5)  # templates that lend a hypothesis their features
+    spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
+    power: float = 2.0  # of the feature agreement beside the depth agreement
+    tolerance: float = 0.05  # depth difference that still agrees, in diameters
 
 
 class Config(eqx.Module):
@@ -72,7 +76,7 @@ class Config(eqx.Module):
     def paper() -> "Config":
         """The paper's choices, its misprints corrected: K = 50, Eq. 5, one view, four-point samples, no gate."""
         return Config(
-            match=MatchConfig(ranking="cyclic", views=1, pairs=50, cycle=float("inf")),
+            match=MatchConfig(ranking="cyclic", centred=False, views=1, pairs=50, cycle=float("inf")),
             align=AlignConfig(
                 count=1000,
                 size=4,

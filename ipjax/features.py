@@ -54,6 +54,36 @@ def observe(
     return Query(describe(encoder, view, config), view)
 
 
+def centre(
+    patches: Patches,
+) -> tuple[Patches, Float[Array, "c"], Float[Array, "v p"]]:
+    """Take the mean of an object's features out of every one of them, and make what is left unit vectors again.
+
+    All patches of one object share most of their feature; what tells them apart is the rest. Centring raises the share
+    of queries whose first template is within 30° (``benchmarks/results``).
+
+    Args:
+      patches: of all templates, ``v p``; the mean is over the valid ones.
+
+    Returns:
+      The patches, the mean, and the norm of each remainder: raw feature = norm · feature + mean.
+    """
+    raw = patches.features.astype(jnp.float32)
+    share = patches.valid.astype(raw.dtype)[..., None]
+    mean = jnp.sum(raw * share, axis=(0, 1)) / jnp.maximum(jnp.sum(share), 1)
+    features, norm = centre_on(raw, mean)
+    return Patches(features.astype(patches.features.dtype), patches.points, patches.grid, patches.valid), mean, norm
+
+
+def centre_on(
+    features: Float[Array, "*b c"], mean: Float[Array, "c"]
+) -> tuple[Float[Array, "*b c"], Float[Array, "*b"]]:
+    """Unit vectors of what is left of features without ``mean``, and its norms; nothing left gives zeros."""
+    rest = features - mean
+    norm = jnp.sqrt(jnp.sum(rest * rest, axis=-1))
+    return rest / jnp.maximum(norm, 1e-9)[..., None], norm
+
+
 def lift(
     view: View, rows: int, columns: int, spread: float
 ) -> tuple[Float[Array, "p 3"], Float[Array, "p"]]:

@@ -18,7 +18,7 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     cosines. ``ranking='cosine'`` sums the cosines of all cycles no longer than ``config.cycle``.
 
     Args:
-      query: patches ``p`` of the crop.
+      query: patches ``p`` of the crop, centred if the templates' are.
       templates: patches ``v q`` of the object.
 
     Returns:
@@ -33,9 +33,7 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
             f"{templates.patches.features.shape[-1]}: they must come from the same encoder"
         )
     patches = templates.patches
-    found = nearest(
-        query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes
-    )
+    found = nearest(query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes)
     distance = jax.vmap(cycle_distance, (0, 0, None, None, 0))(
         found.query_to_template, found.template_to_query, query.grid, query.valid, patches.valid
     )
@@ -50,7 +48,7 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         view = lax.sort((cost, -jnp.sum(cosine, axis=1), jnp.arange(cost.shape[0])), num_keys=2)[2][: config.views]
     else:
         kept = (distance <= config.cycle) & query.valid
-        ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(jnp.sum(query.valid), 1)
+        ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(jnp.sum(query.valid, dtype=jnp.float32), 1)
         view = lax.top_k(ranking, min(config.views, ranking.shape[0]))[1]
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]

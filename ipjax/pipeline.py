@@ -1,12 +1,13 @@
 """Figure 2 of the paper, from the query on: one pure function, one graph."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ipjax.alignment import align
 from ipjax.config import Config
-from ipjax.features import lift
+from ipjax.features import centre_on, lift
 from ipjax.matching import match, select
 from ipjax.refinement import Cloud, refine
 from ipjax.scoring import score
@@ -36,7 +37,12 @@ def estimate(
       ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera.
     """
     with jax.named_scope("match"):
-        matches = match(query.patches, templates, config.match)
+        raw = query.patches
+        query = eqx.tree_at(lambda q: q.patches.features, query, centre_on(raw.features, templates.mean)[0])
+        if config.match.centred:
+            matches = match(query.patches, templates, config.match)
+        else:
+            matches = match(raw, _uncentred(templates), config.match)
         pairs = select(matches, query.patches, templates, config.match)
     with jax.named_scope("align"):
         size = apparent_diameter(query, templates)[matches.view]
@@ -74,9 +80,14 @@ def estimate(
         view=matches.view[view],
         view_score=matches.ranking,
         inliers=jnp.sum(used),
-        rmse=jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(used), 1)),
+        rmse=jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(used, dtype=jnp.float32), 1)),
         success=determined[best],
     )
+
+
+def _uncentred(templates: Templates) -> Templates:
+    raw = templates.patches.features.astype(templates.mean.dtype) * templates.norm[..., None] + templates.mean
+    return eqx.tree_at(lambda t: t.patches.features, templates, raw)
 
 
 def _coarse(query: Query, grid: int):

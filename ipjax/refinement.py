@@ -150,7 +150,7 @@ class NormalCholesky(lx.AbstractLinearSolver):
         normal = jnp.sum(matrix[:, :, None] * matrix[:, None, :], axis=0)
         return matrix, normal
 
-    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> tuple[Any, optx.RESULTS, dict[str, Any]]:
+    def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> Any:
         del options
         matrix, normal = state
         flat, _ = ravel_pytree(vector)

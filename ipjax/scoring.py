@@ -1,16 +1,18 @@
 """How well a hypothesis explains the query: its depth, its mask, and its features. No renderer in the graph.
 
-Depth comes from splatting the object's surface points; features from the template whose viewpoint is nearest to the
-hypothesis', carried on its 3-D points into the query's feature map.
+Depth comes from splatting the object's surface points; features from the templates whose viewpoints are nearest to the
+hypothesis', carried on their 3-D points into the query's feature map.
 """
 
+import jax
 import jax.numpy as jnp
 from ipjax_kernels.rasterize import splat_depth
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import project
 from ipjax.config import ScoreConfig
-from ipjax.types import Camera, Query, Similarity, Surface, Templates
+from ipjax.types import Camera, Patches, Query, Similarity, Surface, Templates
 
 
 def score(
@@ -25,11 +27,12 @@ def score(
     """The score in [0, 1] of one hypothesis; the caller vmaps.
 
     Args:
+      query: its patches centred on the templates' mean, as the templates' are.
       depth, mask, camera: the query's crop on a coarse grid (metres, 0 = unknown; one pixel per cell).
     """
     geometry = depth_agreement(templates.surface, depth, mask, camera, camera_from_object, config)
     features = feature_agreement(templates, query, camera_from_object, config)
-    return geometry * features**2
+    return geometry * features**config.power
 
 
 def depth_agreement(
@@ -60,25 +63,25 @@ def depth_agreement(
     return jnp.sum(agree) / jnp.maximum(jnp.sum(union), 1)
 
 
-def nearest_view(templates: Templates, camera_from_object: Similarity) -> Float[Array, "v"]:
-    """Cosine-like closeness (trace of the relative rotation) of every template to the hypothesis.
+def closeness(templates: Templates, camera_from_object: Similarity) -> Float[Array, "v"]:
+    """The angle (rad) between the hypothesis and the viewpoint of every template.
 
     The hypothesis is turned to the optical axis first: what an off-axis object looks like depends on its ray.
     """
     ray = camera_from_object.translation / jnp.maximum(jnp.linalg.norm(camera_from_object.translation), 1e-9)
-    turned = look_along(ray) @ camera_from_object.rotation
-    return jnp.sum(templates.camera_from_object.rotation * turned, axis=(-2, -1))
+    turned = jnp.sum(look_along(ray)[:, :, None] * camera_from_object.rotation[None], axis=1)
+    trace = jnp.sum(templates.camera_from_object.rotation * turned, axis=(-2, -1))
+    return jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1))
 
 
 def look_along(ray: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The smallest rotation that turns a unit ray onto the optical axis; rays behind the camera stay finite."""
     x, y, z = ray
     factor = 1 / jnp.maximum(1 + z, 1e-6)
-    one = jnp.ones_like(x)
     return jnp.stack(
         [
-            jnp.stack([one - x * x * factor, -x * y * factor, -x]),
-            jnp.stack([-x * y * factor, one - y * y * factor, -y]),
+            jnp.stack([1 - x * x * factor, -x * y * factor, -x]),
+            jnp.stack([-x * y * factor, 1 - y * y * factor, -y]),
             jnp.stack([x, y, z]),
         ]
     )
@@ -90,47 +93,62 @@ def feature_agreement(
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),  # noqa: B008
 ) -> Float[Array, ""]:
-    """Mean cosine between the nearest template's patches, moved by the hypothesis, and the query's features there.
+    """Cosine in [0, 1] between the patches of the nearest templates, moved by the hypothesis, and the query there.
 
-    Patches behind an occluder are left out; patches outside the mask count as zero.
+    Patches behind an occluder are left out; those that fall outside the mask count as zero. Templates are weighted by
+    the angle between their viewpoint and the hypothesis'.
     """
-    view = jnp.argmax(nearest_view(templates, camera_from_object))
-    features = templates.patches.features[view].astype(query.patches.features.dtype)
-    placed = camera_from_object @ templates.patches.points[view]
-    valid = templates.patches.valid[view]
+    angle, views = lax.top_k(-closeness(templates, camera_from_object), min(config.views, templates.norm.shape[0]))
+    weight = jnp.exp(-jnp.square(angle / config.spread))
+    near = jax.tree.map(lambda x: x[views], templates.patches)
+    cosines = jax.vmap(lambda patches: _carried_cosine(patches, query, camera_from_object, config))(near)
+    return jnp.clip(jnp.sum(weight * cosines) / jnp.maximum(jnp.sum(weight), 1e-9), 0, 1)
+
+
+def _carried_cosine(
+    patches: Patches, query: Query, camera_from_object: Similarity, config: ScoreConfig
+) -> Float[Array, ""]:
+    """Mean cosine of one template's patches with the query's features where the hypothesis puts them."""
     height, width = query.view.depth.shape
-    columns, rows = (jnp.max(query.patches.grid, axis=0) + 1).astype(jnp.int32)
-    del rows
-    side = int(round(query.patches.valid.shape[0] ** 0.5))
-    size = width // side
+    rows, columns = _grid_shape(query)
+    placed = camera_from_object @ patches.points
     pixel = project(query.view.camera, placed)
-    cell = (pixel + 0.5) / size - 0.5
-    return _sampled_agreement(cell, placed, features, valid, pixel, query, side, config, camera_from_object.scale)
-
-
-def _sampled_agreement(cell, placed, features, valid, pixel, query, side, config, scale):
-    base = jnp.floor(cell)
-    fraction = cell - base
-    total = jnp.zeros_like(features)
-    share = jnp.zeros_like(placed[:, 0])
-    for dx in (0, 1):
-        for dy in (0, 1):
-            column = base[:, 0].astype(jnp.int32) + dx
-            row = base[:, 1].astype(jnp.int32) + dy
-            inside = (column >= 0) & (column < side) & (row >= 0) & (row < side)
-            index = jnp.clip(row, 0, side - 1) * side + jnp.clip(column, 0, side - 1)
-            weight = jnp.abs(1 - dx - fraction[:, 0]) * jnp.abs(1 - dy - fraction[:, 1])
-            weight = jnp.where(inside & query.patches.valid[index], weight, 0)
-            total = total + weight[:, None] * query.patches.features[index]
-            share = share + weight
-    norm = jnp.sqrt(jnp.sum(total * total, axis=-1) + 1e-12)
-    cosine = jnp.sum(total * features, axis=-1) / norm
-    height, width = query.view.depth.shape
+    cell = (pixel + 0.5) / jnp.array([width / columns, height / rows], pixel.dtype) - 0.5
+    sampled, share = _sample(query.patches, cell, rows, columns)
+    norm = jnp.sqrt(jnp.sum(sampled * sampled, axis=-1) + 1e-12)
+    cosine = jnp.sum(sampled * patches.features.astype(sampled.dtype), axis=-1) / norm
     column = jnp.clip(jnp.round(pixel[:, 0]).astype(jnp.int32), 0, width - 1)
     row = jnp.clip(jnp.round(pixel[:, 1]).astype(jnp.int32), 0, height - 1)
     measured = query.view.depth[row, column]
-    on = query.view.mask[row, column]
-    occluded = ~on & (measured > 0) & (measured < placed[:, 2] - config.tolerance * scale)
-    counted = valid & ~occluded
-    value = jnp.where(share > 0.25, jnp.maximum(cosine, 0), 0)
-    return jnp.sum(jnp.where(counted, value, 0)) / jnp.maximum(jnp.sum(counted), 1)
+    nearer = (measured > 0) & (measured < placed[:, 2] - config.tolerance * camera_from_object.scale)
+    counted = patches.valid & ~(nearer & ~query.view.mask[row, column])
+    value = jnp.where(counted & (share > 0.25), cosine, 0)
+    return jnp.sum(value) / jnp.maximum(jnp.sum(counted, dtype=value.dtype), 1)
+
+
+def _grid_shape(query: Query) -> tuple[int, int]:
+    """Rows and columns of the query's patches, from the shape of its image: patches are square."""
+    height, width = query.view.depth.shape
+    size = round((height * width / query.patches.valid.shape[0]) ** 0.5)
+    return height // size, width // size
+
+
+def _sample(
+    patches: Patches, cell: Float[Array, "n 2"], rows: int, columns: int
+) -> tuple[Float[Array, "n c"], Float[Array, "n"]]:
+    """Bilinear features at grid coordinates (column, row), of valid patches only, and the share that they make up."""
+    base = jnp.floor(cell)
+    fraction = cell - base
+    total = jnp.zeros((cell.shape[0], patches.features.shape[-1]), patches.features.dtype)
+    share = jnp.zeros(cell.shape[0], patches.features.dtype)
+    corner = base.astype(jnp.int32)
+    for right in (0, 1):
+        for down in (0, 1):
+            column, row = corner[:, 0] + right, corner[:, 1] + down
+            inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+            index = jnp.clip(row, 0, rows - 1) * columns + jnp.clip(column, 0, columns - 1)
+            weight = jnp.abs(1 - right - fraction[:, 0]) * jnp.abs(1 - down - fraction[:, 1])
+            weight = jnp.where(inside & patches.valid[index], weight, 0)
+            total = total + weight[:, None] * patches.features[index]
+            share = share + weight
+    return total, share

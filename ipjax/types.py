@@ -64,7 +64,9 @@ class Templates(eqx.Module):
     ``camera_from_object`` is the object's diameter in metres.
     """
 
-    patches: Patches  # leading axes *b v
+    patches: Patches  # leading axes *b v; features centred: see ``ipjax.features.centre``
+    mean: Float[Array, "*b c"]  # of the object's features, taken out of every one of them
+    norm: Float[Array, "*b v p"]  # what was left of each; raw feature = norm · feature + mean
     seen: Float[Array, "*b v p"]  # how much of the patch's surface was seen (1) or guessed (0)
     camera_from_object: Similarity  # leading axes *b v; scale 1, model units
     camera: Camera  # of each template, leading axes *b v; pixels of the rendered image

@@ -16,6 +16,7 @@ from ipjax.types import Camera, Query, Similarity, Surface, Templates, View
 
 AXES = np.array([0.28, 0.38, 0.5])  # semi-axes; the longest makes the diameter 1
 PATCH = 14
+described = jax.jit(describe)
 
 
 class CoordinateEncoder(eqx.Module):
@@ -86,14 +87,16 @@ def make_templates(directions: int = 8, rolls: int = 1, grid: int = 8, channels:
     encoder = make_encoder(channels)
     views, patches = [], []
     for index in range(directions * rolls):
-        pose = jax.tree.map(lambda x, index=index: x[index], poses)
+        pose = jax.tree.map(lambda x, index=index: np.asarray(x)[index], poses)
         view = see(pose, grid * PATCH)
-        found = describe(encoder, view)
-        inside = jnp.sum((found.points - pose.translation)[:, :, None] * pose.rotation[None], axis=1)
+        found = described(encoder, view)
+        inside = jnp.asarray((np.asarray(found.points) - pose.translation) @ pose.rotation)
         patches.append(eqx.tree_at(lambda p: p.points, found, inside))
         views.append(view.camera)
     return Templates(
         patches=jax.tree.map(lambda *x: jnp.stack(x), *patches),
+        mean=jnp.zeros(channels, jnp.float32),
+        norm=jnp.ones((directions * rolls, grid * grid), jnp.float32),
         seen=jnp.ones((directions * rolls, grid * grid), jnp.float32),
         camera_from_object=poses,
         camera=jax.tree.map(lambda *x: jnp.stack(x), *views),
@@ -127,9 +130,9 @@ def make_query(
         jnp.asarray(rng.uniform(0.1, 0.3), jnp.float32),
     )
     view = see(truth, grid * PATCH)
-    hidden = jnp.arange(grid * PATCH) < occlusion * grid * PATCH
+    hidden = jnp.asarray(np.arange(grid * PATCH) < occlusion * grid * PATCH)
     view = View(view.rgb, view.depth, view.mask & ~hidden[None, :], view.camera)
-    patches = describe(make_encoder(channels), view)
+    patches = described(make_encoder(channels), view)
     features = patches.features + noise * jnp.asarray(
         rng.normal(size=patches.features.shape) / channels**0.5, jnp.float32
     )

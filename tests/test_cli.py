@@ -322,6 +322,8 @@ def found_case(tmp_path, monkeypatch):
             grid=both(patches.grid, patches.grid),
             valid=both(patches.valid, patches.valid),
         ),
+        mean=jnp.zeros(patches.features.shape[-1]),
+        norm=jnp.ones((2, 64)),
         seen=jnp.ones((2, 64)),
         camera_from_object=Similarity(
             jnp.asarray(np.stack([rotation, np.eye(3)]), jnp.float32),

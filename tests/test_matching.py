@@ -43,7 +43,8 @@ def golden_problem(features_q, masks_q, features_t, masks_t):
     zeros = jnp.zeros
     templates = Templates(
         patches(features_t, masks_t),
-        jnp.ones((views, features_t.shape[1] * features_t.shape[2]), jnp.float32),
+        jnp.zeros(features_t.shape[-1]),
+        *[jnp.ones((views, features_t.shape[1] * features_t.shape[2]), jnp.float32)] * 2,
         Similarity(jnp.tile(jnp.eye(3), (views, 1, 1)), zeros((views, 3)), jnp.ones(views)),
         Camera(jnp.ones((views, 2)), zeros((views, 2))),
         Surface(zeros((4, 3)), zeros((4, 3)), jnp.ones(4)),

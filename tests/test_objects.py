@@ -32,6 +32,8 @@ def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templ
             grid=normal(views, patches, 2),
             valid=jnp.asarray(rng.random((views, patches)) < 0.7).at[0, 0].set(True),
         ),
+        mean=normal(channels),
+        norm=normal(views, patches),
         seen=normal(views, patches),
         camera_from_object=Similarity(jnp.asarray(rotation, jnp.float32), normal(views, 3), jnp.ones(views)),
         camera=Camera(focal=normal(views, 2), centre=normal(views, 2)),

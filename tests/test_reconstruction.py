@@ -1,4 +1,4 @@
-"""Meshes from one photo: closed, where the photo says, in metres where there is depth, and honest about what is guessed."""
+"""Meshes from one photo: closed, where the photo says, metric where there is depth, open about guesses."""
 
 import dataclasses
 

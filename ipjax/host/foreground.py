@@ -6,6 +6,7 @@ one colour. Where none works, `find_foreground` refuses with one sentence, and l
 
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -118,8 +119,8 @@ def find_foreground(
     photo: Photo,
     *,
     mask: np.ndarray | None = None,
-    box: tuple[float, float, float, float] | None = None,
-    click: tuple[float, float] | None = None,
+    box: Sequence[float] | None = None,
+    click: Sequence[float] | None = None,
     tried: str | Path | None = None,
 ) -> Foreground:
     """The object's mask.
@@ -327,9 +328,9 @@ def _plain_background(rgb: np.ndarray) -> tuple[np.ndarray, float]:
 
     small, _ = _shrink(rgb)
     lab = cv2.cvtColor(cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
-    lab = lab * np.float32([0.5, 1.0, 1.0])
+    lab = lab * np.array([0.5, 1.0, 1.0], np.float32)
     height, width = lab.shape[:2]
-    y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    y, x = np.meshgrid(np.linspace(-1, 1, height), np.linspace(-1, 1, width), indexing="ij")
     terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], -1)
     ring = np.zeros((height, width), bool)
     band = max(2, min(height, width) // 25)
@@ -341,7 +342,7 @@ def _plain_background(rgb: np.ndarray) -> tuple[np.ndarray, float]:
         distance = np.linalg.norm(lab - terms @ model, axis=-1)
         kept = ring & (distance <= max(np.percentile(distance[ring], 75), 1.0))
     spread = float(np.percentile(distance[ring], 90))
-    found = distance > max(6.0, 2.5 * float(np.percentile(distance[kept], 95)))
+    found = distance > max(8.0, 3.0 * float(np.percentile(distance[kept], 95)))
     kernel = np.ones((3, 3), np.uint8)
     found = cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_OPEN, kernel)
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, kernel, iterations=2) > 0

@@ -8,6 +8,7 @@ Frame of the mesh: the camera's axes (x right, y down, z ahead), origin at the c
 """
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -143,7 +144,7 @@ def bulge(inside: Bool[np.ndarray, "r c"], roundness: float = ROUNDNESS) -> Floa
     return roundness * np.sqrt(np.maximum(solved, 0.0))
 
 
-def _nearest(inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(inside: Any) -> tuple[np.ndarray, np.ndarray]:
     """For every place, row and column of the nearest one that is inside."""
     from scipy.ndimage import distance_transform_edt
 
@@ -179,7 +180,7 @@ def _texture(rgb: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, tuple[int, 
     crop = np.s_[top : rows.max() + 5, left : columns.max() + 5]
     sure = np.asarray(binary_erosion(mask[crop], iterations=1))  # pixels at the edge mix object and background
     sure = sure if sure.any() else mask[crop]
-    return rgb[crop][_nearest(sure)], (left, top)
+    return rgb[crop][_nearest(sure)], (int(left), int(top))
 
 
 def _assemble(
@@ -301,14 +302,19 @@ def clean_depth(depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], 
     size = np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1) * middle / focal
     good &= np.abs(depth - middle) < size
     known = np.where(good, depth, 0).astype(np.float32)
-    # Flying pixels hang between two surfaces: few of their neighbours are near them.
-    near, count = np.zeros(depth.shape, int), np.zeros(depth.shape, int)
-    for dy in range(-2, 3):
-        for dx in range(-2, 3):
-            other = np.roll(known, (dy, dx), (0, 1))
-            count += other > 0
-            near += (other > 0) & (np.abs(other - known) < 0.006 + 0.02 * size)
-    return np.where(good & (near >= 0.5 * count) & (near >= 4), depth, 0.0)
+    # Cut where depth jumps, and keep the pieces that are large and not behind the object: what a mask's edge catches of
+    # the background, and flying pixels between, would become spikes.
+    low = cv2.erode(np.where(good, known, 1e3).astype(np.float32), np.ones((3, 3), np.uint8))
+    high = cv2.dilate(known, np.ones((3, 3), np.uint8))
+    calm = good & (high - low < 0.004 + 0.05 * size)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(calm.astype(np.uint8), connectivity=4)
+    if count == 1:
+        return np.zeros(depth.shape)
+    main = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+    large = [i for i in range(1, count) if stats[i, cv2.CC_STAT_AREA] >= 0.05 * stats[main, cv2.CC_STAT_AREA]]
+    centre = float(np.median(known[labels == main]))
+    keep = [i for i in large if abs(float(np.median(known[labels == i])) - centre) < 0.4 * size]
+    return np.where(np.isin(labels, keep), depth, 0.0)
 
 
 def complete_depth(
@@ -374,8 +380,7 @@ def _resample(known: np.ndarray, outline: Outline) -> tuple[np.ndarray, np.ndarr
     weight = cv2.GaussianBlur((known > 0).astype(np.float64), (0, 0), sigma)
     total = cv2.GaussianBlur(known.astype(np.float64), (0, 0), sigma)
     value = look_up(np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0).astype(np.float32), outline.pixels)
-    sure = look_up((weight > 0.4).astype(np.float32), outline.pixels) > 0.99
-    sure &= outline.inside
+    sure = (look_up((weight > 0.4).astype(np.float32), outline.pixels) > 0.99) & outline.inside
     if not sure.any():
         raise ValueError("the depth on the object is too scattered to make a surface of")
     near = _fill(value.astype(np.float64), sure, outline.inside)

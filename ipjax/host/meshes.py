@@ -525,14 +525,14 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
     area = np.linalg.norm(_corner_products(mesh.vertices, faces), axis=-1) / 2
     flat = (area <= 1e-14 * longest**2) | (corners[:, [0, 1, 2]] == corners[:, [1, 2, 0]]).any(1)
     if flat.any():
-        report.append(f"removed {_count(flat.sum(), 'face')} without area")
+        report.append(f"removed {_count(int(flat.sum()), 'face')} without area")
         faces, corners, area = faces[~flat], corners[~flat], area[~flat]
     if len(faces) == 0:
         raise ValueError("no face of the mesh has an area")
     fresh = np.zeros(len(faces), bool)
     fresh[np.unique(np.sort(corners, axis=1), axis=0, return_index=True)[1]] = True
     if not fresh.all():
-        report.append(f"removed {_count((~fresh).sum(), 'repeated face')}")
+        report.append(f"removed {_count(int((~fresh).sum()), 'repeated face')}")
         faces, corners, area = faces[fresh], corners[fresh], area[fresh]
 
     # Flecks.
@@ -591,7 +591,7 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
 
 
 def _count(number: int, noun: str, plural: str = "") -> str:
-    return f"{int(number)} {noun if number == 1 else plural or noun + 's'}"
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def _pieces(corners: np.ndarray, count: int) -> np.ndarray:

@@ -4,7 +4,7 @@ Layout: one safetensors file (https://github.com/huggingface/safetensors). Its m
 key ``ipjax``: format version, who the object and the encoder are, how the normalised object frame lies in the user's
 mesh, and a checksum. Tensors, for v templates of p patches with c channels:
 
-    features f16 [v p c] · points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
+    features f16 [v p c] · mean f32 [c] · norm f32 [v p] · points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
     rotation f32 [v 3 3] · translation f32 [v 3] · focal, centre f32 [v 2]           camera_from_object and its camera
     surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3]
     mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
@@ -35,6 +35,8 @@ _TEMPLATE_TENSORS = {
     "points": ("float32", "vp3"),
     "grid": ("float32", "vp2"),
     "valid": ("bool", "vp"),
+    "mean": ("float32", "c"),
+    "norm": ("float32", "vp"),
     "seen": ("float32", "vp"),
     "rotation": ("float32", "v33"),
     "translation": ("float32", "v3"),
@@ -130,6 +132,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         "points": patches.points,
         "grid": patches.grid,
         "valid": patches.valid,
+        "mean": templates.mean,
+        "norm": templates.norm,
         "seen": templates.seen,
         "rotation": pose.rotation,
         "translation": pose.translation,
@@ -216,6 +220,8 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
             patches=Patches(
                 features=device["features"], points=device["points"], grid=device["grid"], valid=device["valid"]
             ),
+            mean=device["mean"],
+            norm=device["norm"],
             seen=device["seen"],
             camera_from_object=Similarity(
                 rotation=device["rotation"],

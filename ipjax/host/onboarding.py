@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
-from ipjax.features import describe
+from ipjax.features import centre, describe
 from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_surface
 from ipjax.host.objects import ObjectInfo, save
 from ipjax.host.rendering import render
@@ -70,8 +70,11 @@ def make_templates(
         one, sure = _describe_view(encoder, view, pose, surface, config.describe)
         patches.append(one)
         seen.append(sure)
+    patches, mean, norm = jax.jit(centre)(jax.tree.map(lambda *x: jnp.stack(x), *patches))
     templates = Templates(
-        patches=jax.tree.map(lambda *x: jnp.stack(x), *patches),
+        patches=patches,
+        mean=mean,
+        norm=norm,
         seen=jnp.stack(seen),
         camera_from_object=poses,
         camera=cameras,

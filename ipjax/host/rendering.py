@@ -100,6 +100,8 @@ def render(
     )
     if rotation.ndim == 2:
         rotation, translation, scale = rotation[None], translation[None], scale[None]
+    if not (np.isfinite(scale) & (scale > 0)).all():
+        raise ValueError("the scale of a pose to render is not positive")
     # A similarity seen by a pinhole is a rigid motion seen from 1/scale as far, with depths times the scale.
     poses = np.concatenate([rotation, (translation / scale[:, None])[..., None]], axis=-1)[:, None]
     job = _Job([mesh], poses, scale, camera, height, width, oversample, light, False)
@@ -145,11 +147,13 @@ def render_scene(
 
 def available_backends() -> dict[str, str]:
     """What each backend of this system says when asked to draw a triangle: "ok" or the reason it cannot."""
+    import jax.numpy as jnp
+
     from ipjax.host.meshes import make_mesh
 
     triangle = make_mesh(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]]))
     pose = np.concatenate([np.eye(3), [[0.0], [0.0], [2.0]]], axis=-1)[None, None]
-    camera = Camera(focal=np.full(2, 8.0, np.float32), centre=np.full(2, 3.5, np.float32))  # type: ignore[arg-type]
+    camera = Camera(focal=jnp.full(2, 8.0, jnp.float32), centre=jnp.full(2, 3.5, jnp.float32))
     job = _Job([triangle], pose, np.ones(1), camera, 8, 8, 1, None, False)
     report = {}
     for name in [*_candidates(), "raster"]:
