@@ -1,5 +1,7 @@
 """Nearest neighbours: golden files, the slow twin, laws, the bound on memory, the fused kernel."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -215,7 +217,7 @@ def test_temporary_memory_is_bounded(patches, memory_bytes):
 def test_no_callback_and_exportable():
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lattice(0))
     exported = jax.export.export(jax.jit(lambda *a: tuple(nearest(*a))), platforms=("cpu", "cuda", "tpu"))(*shapes)
-    assert "callback" not in exported.mlir_module()
+    assert not re.findall(r"custom_call @\w*(?:callback|lapack|cusolver)", exported.mlir_module())
     restored = jax.export.deserialize(exported.serialize())
     assert_equal(restored.call(*lattice(5)), nearest(*lattice(5)))
 

@@ -1,0 +1,70 @@
+"""Timing: everything of a row compiled first, then run in turns, so that a busy moment hits all alike."""
+
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+
+def compile_fresh(function: Callable, *arguments) -> tuple[Callable, float, int]:
+    """The compiled function, the seconds its compilation took, and the bytes of its temporary arrays."""
+    lowered = jax.jit(function).lower(*arguments)
+    start = time.perf_counter()
+    compiled = lowered.compile()
+    seconds = time.perf_counter() - start
+    memory = compiled.memory_analysis()
+    return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1
+
+
+def time_in_turns(calls: dict[str, Callable[[], Any]], repeats: int, seconds: float = 20.0) -> dict[str, list[float]]:
+    """Seconds of every call, run one after another ``repeats`` times; fewer (at least 3) once ``seconds`` are spent."""
+    for call in calls.values():
+        jax.block_until_ready(call())
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    begin = time.perf_counter()
+    for turn in range(repeats):
+        if turn >= 3 and time.perf_counter() - begin > seconds:
+            break
+        for name, call in calls.items():
+            start = time.perf_counter()
+            jax.block_until_ready(call())
+            times[name].append(time.perf_counter() - start)
+    return times
+
+
+def summarise(times: list[float]) -> dict[str, float | int]:
+    """Median, quartiles and the fastest, in milliseconds."""
+    low, middle, high = statistics.quantiles(times, n=4) if len(times) > 1 else [times[0]] * 3
+    return {
+        "median_ms": middle * 1e3,
+        "quartile_1_ms": low * 1e3,
+        "quartile_3_ms": high * 1e3,
+        "fastest_ms": min(times) * 1e3,
+        "runs": len(times),
+    }
+
+
+def describe_device() -> dict[str, str | int]:
+    """What the figures were measured on."""
+    device = jax.devices()[0]
+    name = device.device_kind
+    if device.platform == "cpu":
+        name = platform.processor() or platform.machine()
+        info = Path("/proc/cpuinfo")
+        if info.exists():
+            models = [line.split(":")[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+            name = models[0] if models else name
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 0
+    return {
+        "platform": device.platform,
+        "device": name,
+        "cores": cores,
+        "jax": jax.__version__,
+        "python": platform.python_version(),
+        "system": platform.system(),
+    }

@@ -1,0 +1,71 @@
+"""``python -m benchmarks.table results.json … [--into README.md]``: results as Markdown, by hand never.
+
+With ``--into`` the text between ``<!-- benchmarks -->`` and ``<!-- /benchmarks -->`` of that file is replaced.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
+COLUMNS = {
+    "what": lambda row: row["name"],
+    "how": lambda row: row["implementation"],
+    "size": lambda row: row["size"],
+    "dtype": lambda row: row["dtype"],
+    "median": lambda row: milliseconds(row.get("median_ms")),
+    "quartiles": lambda row: (
+        f"{milliseconds(row['quartile_1_ms'])} – {milliseconds(row['quartile_3_ms'])}" if "quartile_1_ms" in row else ""
+    ),
+    "compile": lambda row: f"{row['compile_s']:.2g} s" if "compile_s" in row else "",
+    "temporary": lambda row: f"{row['temporary_bytes'] / 2**20:.3g} MiB" if "temporary_bytes" in row else "",
+    "GFLOP/s": lambda row: f"{row['gflop_per_s']:.0f}" if "gflop_per_s" in row else "",
+    "ratio": lambda row: ratio(row),
+}
+
+
+def render(results: dict) -> str:
+    """One device's results as a heading and a table."""
+    lines = [
+        f"**{results['device']}** ({results['platform']}, {results['cores']} cores), jax {results['jax']}, "
+        f"Python {results['python']}, {results['date']}" + (" — quick run, small sizes" if results["quick"] else ""),
+        "",
+        "| " + " | ".join(COLUMNS) + " |",
+        "|" + " --- |" * len(COLUMNS),
+    ]
+    lines += ["| " + " | ".join(cell(row) for cell in COLUMNS.values()) + " |" for row in results["rows"]]
+    return "\n".join(lines) + "\n"
+
+
+def milliseconds(value: float | None) -> str:
+    if value is None:
+        return ""
+    return f"{value:.3g} ms" if value < 1000 else f"{value / 1000:.3g} s"
+
+
+def ratio(row: dict) -> str:
+    if "ratio_to_product" in row:
+        return f"{row['ratio_to_product']:.2f} × product, {row['ratio_to_large_product']:.2f} × large product"
+    if "ratio_to_kernel" in row:
+        return f"{row['ratio_to_kernel']:.3g} × kernel"
+    return f"{100 * row['disagreement']:.2g} %" if "disagreement" in row else ""
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.table", description=__doc__)
+    parser.add_argument("results", type=Path, nargs="+")
+    parser.add_argument("--into", type=Path, metavar="FILE")
+    options = parser.parse_args()
+    text = "\n".join(render(json.loads(path.read_text())) for path in options.results)
+    if options.into is None:
+        print(text)
+        return
+    page = options.into.read_text()
+    if BEGIN not in page or END not in page:
+        parser.error(f"{options.into} has no {BEGIN} … {END}")
+    before, rest = page.split(BEGIN, 1)
+    options.into.write_text(before + BEGIN + "\n" + text + END + rest.split(END, 1)[1])
+
+
+if __name__ == "__main__":
+    main()
