@@ -724,7 +724,7 @@ def sample_surface(
     chosen = farthest_points(points, count)
     normals = _unit(products[face[chosen]])
     seen = np.einsum("kc,kc->k", weights[chosen], mesh.seen[corners[chosen]])
-    return points[chosen], normals, np.clip(seen, 0, 1)
+    return points[chosen], normals, np.clip(np.round(seen, 6), 0, 1)  # weights sum to 1 only to within rounding
 
 
 def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " k"]:
