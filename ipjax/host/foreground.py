@@ -119,8 +119,8 @@ def find_foreground(
     photo: Photo,
     *,
     mask: np.ndarray | None = None,
-    box: Sequence[float] | None = None,
-    click: Sequence[float] | None = None,
+    box: Sequence[int | float] | None = None,
+    click: Sequence[int | float] | None = None,
     tried: str | Path | None = None,
 ) -> Foreground:
     """The object's mask.
