@@ -12,7 +12,7 @@ from tqdm import tqdm
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.features import centre, describe
-from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_surface
+from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_surface, sample_texture
 from ipjax.host.objects import ObjectInfo, save
 from ipjax.host.rendering import render
 from ipjax.host.viewpoints import viewpoints
@@ -129,6 +129,7 @@ def onboard(
     mesh, repairs = clean(mesh)
     mesh = normalise(mesh)
     templates, pictures = make_templates(mesh, encoder, config, progress=progress, backend=backend)
+    textured = None if mesh.texture is None or mesh.uv is None else (mesh.texture, mesh.uv)
     info = ObjectInfo(
         name=name or (path.stem if path else "object"),
         encoder=encoder.identity,
@@ -142,7 +143,7 @@ def onboard(
         resolution=config.resolution,
         vertices=mesh.vertices,
         faces=mesh.faces,
-        colours=surface_colours(mesh),
+        colours=mesh.colours if textured is None else sample_texture(*textured),
         pictures=pictures,
     )
     if out is not None:
