@@ -48,7 +48,9 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         view = lax.sort((cost, -jnp.sum(cosine, axis=1), jnp.arange(cost.shape[0])), num_keys=2)[2][: config.views]
     else:
         kept = (distance <= config.cycle) & query.valid
-        ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(jnp.sum(query.valid, dtype=jnp.float32), 1)
+        ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(
+            jnp.sum(query.valid, dtype=jnp.float32), 1
+        )
         view = lax.top_k(ranking, min(config.views, ranking.shape[0]))[1]
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]
@@ -63,14 +65,17 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
 
 
 def _order(distance: Float[Array, "p"], similarity: Float[Array, "p"]):
-    """Patches by distance, then cosine (high first), then index; a total order, so the result is the same everywhere."""
+    """Patches by distance, then cosine (high first), then index: a total order, the same everywhere."""
     index = jnp.arange(distance.shape[0])
     near, negative, index = lax.sort((distance, -similarity, index), num_keys=2, is_stable=True)
     return index, near, -negative
 
 
 def select(
-    matches: Matches, query: Patches, templates: Templates, config: MatchConfig = MatchConfig()  # noqa: B008
+    matches: Matches,
+    query: Patches,
+    templates: Templates,
+    config: MatchConfig = MatchConfig(),  # noqa: B008
 ) -> Pairs:
     """Lift matches to pairs of 3-D points, ``[v k]``; the weight falls with the cycle and rises with the cosine."""
     points = templates.patches.points[matches.view]

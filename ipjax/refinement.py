@@ -7,7 +7,6 @@ surface point. One direction alone lets a free scale shrink or grow the object a
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import lineax as lx
 import optimistix as optx

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ipjax.config import Config
 from ipjax.dinov2 import Encoder
@@ -115,13 +115,13 @@ def write_mesh(path: Path, mesh: Mesh) -> Path:
     """Write a mesh with its texture or its vertex colours; the suffix decides the format."""
     import trimesh
     from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
 
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
     if mesh.texture is not None and mesh.uv is not None:
-        material = trimesh.visual.material.PBRMaterial(
-            baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0
-        )
-        shape.visual = trimesh.visual.TextureVisuals(uv=mesh.uv, material=material)
+        material = PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0)
+        shape.visual = TextureVisuals(uv=mesh.uv, material=material)
     else:
         shape.visual.vertex_colors = mesh.colours  # type: ignore[union-attr]
     shape.export(path)
@@ -155,7 +155,7 @@ def compare(found: Similarity, true: Similarity, mesh: Mesh) -> Comparison:
         true_size=size,
         size=float(found.scale),
         add=float(np.linalg.norm(a - b, axis=-1).mean() / size),
-        adds=float(cKDTree(a).query(b)[0].mean() / size),
+        adds=float(KDTree(a).query(b)[0].mean() / size),
     )
 
 

@@ -396,7 +396,7 @@ def _inflated_thickness(outline: Outline, near: np.ndarray, cell: float, roundne
     from scipy.ndimage import binary_erosion
 
     inside = outline.inside
-    rim = inside & ~np.asarray(binary_erosion(inside))
+    rim = inside & np.logical_not(binary_erosion(inside))
     middle = _fill(near, rim, inside)  # a sheet stretched over the rim
     measured = 2 * np.maximum(middle - near, 0.0)
     inflated = 2 * cell * bulge(inside, roundness)
@@ -463,7 +463,7 @@ def find_plane(
         node = lookup[row, column]
         gap = mirrored[..., 2] - measured_z.reshape(-1)[node]
         hidden = (surface[row, column] > 0) & (surface[row, column] < mirrored[..., 2] - tolerance)
-        against = np.where(on, gap < -tolerance, within & ~soft[row, column] & ~hidden)
+        against = np.where(on, gap < -tolerance, within & np.logical_not(soft[row, column] | hidden))
         agree = (measured_n.reshape(-1, 3)[node] * turned[None]).sum(-1) > 0.7
         matched = on & (np.abs(gap) < 0.5 * tolerance) & agree
         # Points near the plane map onto themselves whatever the surface: they support nothing.
