@@ -16,7 +16,7 @@ def _static(default):
 class DescribeConfig(eqx.Module):
     """From a view to its patches."""
 
-    cover: float = 0.3  # least share of a patch that must be object with a depth
+    cover: float = 0.2  # least share of a patch that must be object with a depth
     spread: float = 0.05  # depths farther than this share of their patch's median belong to something else
 
 
@@ -62,6 +62,7 @@ class ScoreConfig(eqx.Module):
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
     power: float = 2.0  # of the feature agreement beside the depth agreement
     tolerance: float = 0.05  # depth difference that still agrees, in diameters
+    alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
 
 class Config(eqx.Module):

@@ -3,7 +3,9 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ipjax.alignment import align
 from ipjax.config import Config
@@ -46,54 +48,99 @@ def estimate(
         pairs = select(matches, query.patches, templates, config.match)
     with jax.named_scope("align"):
         size = apparent_diameter(query, templates)[matches.view]
-        poses, agreement, inliers, determined = align(pairs, size, key, config.align, diameter=diameter)
-    keep = config.align.keep
+        poses, agreement, _, determined = align(pairs, size, key, config.align, diameter=diameter)
+    parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
     if config.score.ranking == "render":
-        grid = config.score.resolution
-        points, cover = lift(query.view, grid, grid, 0.05)
-        cell = query.view.depth.shape[0] / grid
-        camera = Camera(query.view.camera.focal / cell, (query.view.camera.centre + 0.5) / cell - 0.5)
-        cloud = Cloud(points.reshape(grid, grid, 3), (cover > 0.3).reshape(grid, grid), camera)
-        if config.refine.steps:
-            with jax.named_scope("refine"):
-                poses, _ = jax.vmap(
-                    lambda pose: refine(
-                        templates.surface, cloud, pose, config.refine, scale_known=diameter is not None
-                    )
-                )(poses)
-        with jax.named_scope("score"):
-            depth, mask = _coarse(query, grid)
-            agreement = jax.vmap(lambda pose: score(templates, query, depth, mask, camera, pose, config.score))(poses)
-    agreement = jnp.where(determined, agreement, -1)
-    order = jnp.argsort(-agreement, stable=True)
-    best = order[0]
-    poses = jax.tree.map(lambda x: x[order], poses)
+        scene = _Scene(query, config.score.resolution)
+        judge = lambda poses: _improve_and_score(
+            templates, query, scene, poses, config, scale_known=diameter is not None
+        )
+        poses, agreement = judge(poses)
+        agreement = jnp.where(determined, agreement, -1)
+        if config.score.alternates:
+            with jax.named_scope("alternates"):
+                agreement, order = lax.top_k(agreement, agreement.shape[0])
+                poses, parent, determined = jax.tree.map(lambda x: x[order], (poses, parent, determined))
+                turned = turn(jax.tree.map(lambda x: x[: config.score.alternates], poses), templates.axes)
+                turns = turned.scale.shape[0] // config.score.alternates
+                again = lambda x: jnp.repeat(x[: config.score.alternates], turns, axis=0)
+                turned, other = judge(turned)
+                other = jnp.where(again(determined), other, -1)
+                poses = jax.tree.map(lambda *x: jnp.concatenate(x), poses, turned)
+                agreement, parent, determined = (
+                    jnp.concatenate(x)
+                    for x in ((agreement, other), (parent, again(parent)), (determined, again(determined)))
+                )
+    else:
+        agreement = jnp.where(determined, agreement, -1)
+    agreement, order = lax.top_k(agreement, agreement.shape[0])
+    poses, parent, determined = jax.tree.map(lambda x: x[order], (poses, parent, determined))
     answer: Similarity = jax.tree.map(lambda x: x[0], poses)
-    view = best // keep
-    used = inliers[best]
-    offset = answer @ pairs.object[view] - pairs.camera[view]
-    squared = jnp.where(used, jnp.sum(offset**2, axis=-1), 0)
+    offset = answer @ pairs.object[parent[0]] - pairs.camera[parent[0]]
+    squared = jnp.sum(offset**2, axis=-1)
+    used = (pairs.weight[parent[0]] > 0) & (squared < (config.align.threshold * answer.scale) ** 2) & determined[0]
+    count = jnp.sum(used)
     return PoseEstimate(
         camera_from_object=answer,
-        confidence=jnp.clip(agreement[best], 0, 1),
-        hypotheses=Hypotheses(poses, jnp.clip(agreement[order], 0, 1)),
-        view=matches.view[view],
+        confidence=jnp.clip(agreement[0], 0, 1),
+        hypotheses=Hypotheses(poses, jnp.clip(agreement, 0, 1)),
+        view=matches.view[parent[0]],
         view_score=matches.ranking,
-        inliers=jnp.sum(used),
-        rmse=jnp.sqrt(jnp.sum(squared) / jnp.maximum(jnp.sum(used, dtype=jnp.float32), 1)),
-        success=determined[best],
+        inliers=count,
+        rmse=jnp.sqrt(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
+        success=determined[0],
     )
+
+
+class _Scene(eqx.Module):
+    """The crop on a coarse grid: what refinement fits and what scores compare with."""
+
+    cloud: Cloud
+    depth: Float[Array, "g g"]  # background included: it shows what occludes
+    mask: Bool[Array, "g g"]
+
+    def __init__(self, query: Query, grid: int):
+        side = query.view.depth.shape[0]
+        cell = side / grid
+        points, cover = lift(query.view, grid, grid, 0.05)
+        camera = Camera(query.view.camera.focal / cell, (query.view.camera.centre + 0.5) / cell - 0.5)
+        self.cloud = Cloud(points.reshape(grid, grid, 3), (cover > 0.3).reshape(grid, grid), camera)
+        nearest = np.floor((np.arange(grid) + 0.5) * cell).astype(np.int32)
+        self.depth = query.view.depth[nearest[:, None], nearest]
+        self.mask = query.view.mask[nearest[:, None], nearest]
+
+
+def _improve_and_score(
+    templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config, *, scale_known: bool
+) -> tuple[Similarity, Float[Array, "h"]]:
+    if config.refine.steps:
+        with jax.named_scope("refine"):
+            fit = lambda pose: refine(templates.surface, scene.cloud, pose, config.refine, scale_known=scale_known)[0]
+            poses = jax.vmap(fit)(poses)
+    with jax.named_scope("score"):
+        camera = scene.cloud.camera
+        rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score)
+        return poses, jax.vmap(rate)(poses)
+
+
+def turn(poses: Similarity, axes: Float[Array, "3 3"]) -> Similarity:
+    """Each pose turned by 90°, 180° and 270° about each axis through the object's centre: ``n`` poses give ``9 n``.
+
+    Boxes and cans fit their depth in several of these; correspondences often settle on a wrong one.
+    """
+    quarter = np.array(
+        [[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]
+    )
+    turns = np.concatenate([np.linalg.matrix_power(quarter, k) for k in (1, 2, 3)]).astype(np.float32)
+    about = jnp.einsum("ki,tkl,lj->tij", axes, turns, axes, precision="highest")
+    rotation = jnp.einsum("nij,tjk->ntik", poses.rotation, about, precision="highest").reshape(-1, 3, 3)
+    repeat = lambda x: jnp.repeat(x, len(turns), axis=0)
+    return Similarity(rotation, repeat(poses.translation), repeat(poses.scale))
 
 
 def _uncentred(templates: Templates) -> Templates:
     raw = templates.patches.features.astype(templates.mean.dtype) * templates.norm[..., None] + templates.mean
     return eqx.tree_at(lambda t: t.patches.features, templates, raw)
-
-
-def _coarse(query: Query, grid: int):
-    """Depth and mask of the crop, background included, by the nearest pixel to each cell's centre."""
-    step = query.view.depth.shape[0] // grid
-    return query.view.depth[step // 2 :: step, step // 2 :: step], query.view.mask[step // 2 :: step, step // 2 :: step]
 
 
 def apparent_diameter(query: Query, templates: Templates) -> Float[Array, "v"]:

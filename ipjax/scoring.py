@@ -114,7 +114,10 @@ def _carried_cosine(
     placed = camera_from_object @ patches.points
     pixel = project(query.view.camera, placed)
     cell = (pixel + 0.5) / jnp.array([width / columns, height / rows], pixel.dtype) - 0.5
-    sampled, share = _sample(query.patches, cell, rows, columns)
+    # Patches of the mask without a depth have no point, but their features are as good.
+    inside = query.view.mask.reshape(rows, height // rows, columns, width // columns)
+    inside = jnp.mean(inside.astype(pixel.dtype), axis=(1, 3)).reshape(-1) > 0.25
+    sampled, share = _sample(query.patches.features, inside, cell, rows, columns)
     norm = jnp.sqrt(jnp.sum(sampled * sampled, axis=-1) + 1e-12)
     cosine = jnp.sum(sampled * patches.features.astype(sampled.dtype), axis=-1) / norm
     column = jnp.clip(jnp.round(pixel[:, 0]).astype(jnp.int32), 0, width - 1)
@@ -134,13 +137,13 @@ def _grid_shape(query: Query) -> tuple[int, int]:
 
 
 def _sample(
-    patches: Patches, cell: Float[Array, "n 2"], rows: int, columns: int
+    features: Float[Array, "p c"], valid: Bool[Array, "p"], cell: Float[Array, "n 2"], rows: int, columns: int
 ) -> tuple[Float[Array, "n c"], Float[Array, "n"]]:
     """Bilinear features at grid coordinates (column, row), of valid patches only, and the share that they make up."""
     base = jnp.floor(cell)
     fraction = cell - base
-    total = jnp.zeros((cell.shape[0], patches.features.shape[-1]), patches.features.dtype)
-    share = jnp.zeros(cell.shape[0], patches.features.dtype)
+    total = jnp.zeros((cell.shape[0], features.shape[-1]), features.dtype)
+    share = jnp.zeros(cell.shape[0], features.dtype)
     corner = base.astype(jnp.int32)
     for right in (0, 1):
         for down in (0, 1):
@@ -148,7 +151,7 @@ def _sample(
             inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
             index = jnp.clip(row, 0, rows - 1) * columns + jnp.clip(column, 0, columns - 1)
             weight = jnp.abs(1 - right - fraction[:, 0]) * jnp.abs(1 - down - fraction[:, 1])
-            weight = jnp.where(inside & patches.valid[index], weight, 0)
-            total = total + weight[:, None] * patches.features[index]
+            weight = jnp.where(inside & valid[index], weight, 0)
+            total = total + weight[:, None] * features[index]
             share = share + weight
     return total, share

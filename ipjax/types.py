@@ -72,6 +72,7 @@ class Templates(eqx.Module):
     camera: Camera  # of each template, leading axes *b v; pixels of the rendered image
     surface: Surface
     extents: Float[Array, "*b 3"]  # sides of the axis-aligned bounding box, model units
+    axes: Float[Array, "*b 3 3"]  # rows: unit axes of the smallest box around the object, about which it may look alike
 
 
 class Query(eqx.Module):

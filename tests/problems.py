@@ -102,6 +102,7 @@ def make_templates(directions: int = 8, rolls: int = 1, grid: int = 8, channels:
         camera=jax.tree.map(lambda *x: jnp.stack(x), *views),
         surface=make_surface(512),
         extents=jnp.asarray(2 * AXES, jnp.float32),
+        axes=jnp.eye(3, dtype=jnp.float32),
     )
 
 

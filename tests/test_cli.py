@@ -333,6 +333,7 @@ def found_case(tmp_path, monkeypatch):
         camera=Camera(focal=jnp.full((2, 2), focal), centre=jnp.full((2, 2), centre)),
         surface=Surface(points=to_object(cloud), normals=flat, seen=jnp.ones(len(cloud))),
         extents=jnp.asarray(np.ptp(np.asarray(to_object(cloud)), axis=0), jnp.float32),
+        axes=jnp.eye(3),
     )
     info = dataclasses.replace(make_object()[1], encoder="cells", resolution=224, vertices=None, faces=None)
     info = dataclasses.replace(info, pictures=np.stack([rgb, rgb]), colours=None)

@@ -49,6 +49,7 @@ def golden_problem(features_q, masks_q, features_t, masks_t):
         Camera(jnp.ones((views, 2)), zeros((views, 2))),
         Surface(zeros((4, 3)), zeros((4, 3)), jnp.ones(4)),
         jnp.ones(3),
+        jnp.eye(3),
     )
     return patches(features_q, masks_q), templates
 
@@ -137,7 +138,7 @@ def test_channels_must_agree(templates, query):
     config.update("jaxtyping_disable", True)
     try:
         short = eqx.tree_at(lambda q: q.features, query, query.features[:, :16])
-        with pytest.raises(ValueError, match="16 channels.*same encoder"):
+        with pytest.raises(ValueError, match=r"16 channels.*same encoder"):
             match(short, templates)
     finally:
         config.update("jaxtyping_disable", False)

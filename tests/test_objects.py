@@ -39,6 +39,7 @@ def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templ
         camera=Camera(focal=normal(views, 2), centre=normal(views, 2)),
         surface=Surface(points=normal(points, 3), normals=normal(points, 3), seen=normal(points)),
         extents=normal(3),
+        axes=normal(3, 3),
     )
     info = ObjectInfo(
         name="mug",

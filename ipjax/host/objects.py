@@ -46,6 +46,7 @@ _TEMPLATE_TENSORS = {
     "surface.normals": ("float32", "n3"),
     "surface.seen": ("float32", "n"),
     "extents": ("float32", "3"),
+    "axes": ("float32", "33"),
 }
 _OPTIONAL_TENSORS = {
     "mesh.vertices": ("float32", "a3"),
@@ -143,6 +144,7 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         "surface.normals": templates.surface.normals,
         "surface.seen": templates.surface.seen,
         "extents": templates.extents,
+        "axes": templates.axes,
     }
     if np.ndim(patches.features) != 3:
         raise ValueError(
@@ -233,6 +235,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
                 points=device["surface.points"], normals=device["surface.normals"], seen=device["surface.seen"]
             ),
             extents=device["extents"],
+            axes=device["axes"],
         ),
         info,
     )

@@ -43,6 +43,16 @@ def framing_cameras(
     )
 
 
+def box_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
+    """The axes (rows, a rotation) of the smallest box around the points: what a box or a can turns or flips about."""
+    import trimesh
+
+    # To a ten-thousandth: the search is discontinuous, and its last digits would otherwise decide between equal boxes.
+    box_from_points, _ = trimesh.bounds.oriented_bounds(np.round(points, 4))
+    axes = box_from_points[:3, :3]
+    return axes * np.sign(np.linalg.det(axes))
+
+
 def make_templates(
     mesh: Mesh,
     encoder: Encoder,
@@ -80,6 +90,7 @@ def make_templates(
         camera=cameras,
         surface=surface,
         extents=jnp.asarray(np.ptp(mesh.vertices, axis=0), jnp.float32),
+        axes=jnp.asarray(box_axes(mesh.vertices[np.unique(mesh.faces)]), jnp.float32),
     )
     return templates, views.rgb
 

@@ -13,7 +13,7 @@ from ipjax_kernels.consensus import consensus, draw_minimal_sets, residuals
 from ipjax_kernels.similarity import umeyama
 from jaxtyping import config as jaxtyping_config
 
-PAIRS, COUNT, KEEP = 40, 256, 4
+PAIRS, COUNT, KEEP = 40, 512, 4
 CASES = ("out30_n100", "out60_n100", "out80_n100", "out60_n50", "out80_n200")
 
 
@@ -39,10 +39,10 @@ def test_golden_tables(case, size, request):
     squared = np.asarray(residuals(rotation, translation, scale, source, target))[:, :pairs]
     distance = np.sqrt(squared)
     count = np.sum(distance < threshold, axis=1)
-    near = np.sum(np.abs(distance - threshold) < 1e-6, axis=1)
+    # The reference adds 1e-6 to every coordinate's difference: up to 1.7e-6 of distance, and float32 rounding.
+    near = np.sum(np.abs(distance - threshold) < 2e-6, axis=1)
     judged = np.asarray(success)
     assert judged.mean() > 0.99
-    # Exactly, up to points within 1e-6 of the threshold.
     assert np.all((np.abs(count - data[f"m{size}_count"]) <= near)[judged])
     np.testing.assert_allclose(squared.sum(axis=1)[judged], data[f"m{size}_ssr"][judged], rtol=2e-3)
 
@@ -92,14 +92,16 @@ def problem(seed, outliers, scale=0.2, noise=0.0):
 
 def solve(source, target, weight, threshold=0.02, key=0, **options):
     options = dict(count=COUNT, keep=KEEP, refits=2, relative=True) | options
-    return consensus(jax.random.key(key), source, target, weight, jnp.float32(threshold), **options)
+    gates = dict(scale_bounds=(0.0, np.inf), edge_ratio=0.0, spread=0.0)  # all of them always: one trace
+    gates = {name: jax.tree.map(jnp.float32, options.pop(name, value)) for name, value in gates.items()}
+    return consensus(jax.random.key(key), source, target, weight, jnp.float32(threshold), **gates, **options)
 
 
 @given(seed=st.integers(0, 2**31), outliers=st.sampled_from([0, 0.3, 0.6]), log_scale=st.floats(-3, 3))
 def test_recovers(seed, outliers, log_scale):
     scale = 10**log_scale
     source, target, weight, rotation, translation, inside = problem(seed, outliers, scale, noise=0.002)
-    found = solve(source, target, weight, count=1024)
+    found = solve(source, target, weight)
     assert found.success[0]
     np.testing.assert_allclose(found.rotation[0], rotation, atol=0.03)
     np.testing.assert_allclose(found.scale[0], scale, rtol=0.03)
@@ -115,8 +117,6 @@ def test_laws(seed):
     again = solve(source, target, weight, key=seed)
     for mine, theirs in zip(found, again, strict=True):  # the same key, the same answer
         np.testing.assert_array_equal(mine, theirs)
-    # Refits never lower the best score.
-    assert found.score[0] >= solve(source, target, weight, key=seed, refits=0).score[0]
     # Weight 0 is absent, even as NaN.
     fewer = weight.at[:5].set(0)
     plain = solve(source, target, fewer, key=seed)
@@ -129,6 +129,8 @@ def test_laws(seed):
     order = np.random.default_rng(seed).permutation(PAIRS)
     place = jnp.asarray(np.argsort(order), jnp.int32)
     mine = solve(source, target, weight, sets=table)
+    # Refits never lower the best score.
+    assert mine.score[0] >= solve(source, target, weight, sets=table, keep=COUNT, refits=0).score[0]
     theirs = solve(source[order], target[order], weight[order], sets=place[table])
     np.testing.assert_allclose(mine.score, theirs.score, atol=1e-4)
     # The target's frame and unit do not matter.
@@ -142,10 +144,11 @@ def test_laws(seed):
 @pytest.mark.parametrize("relative", [False, True])
 def test_twin(rank, relative):
     source, target, weight, *_ = problem(5, 0.5, noise=0.01)
-    table = np.stack([np.random.default_rng(5).permutation(PAIRS)[:3] for _ in range(COUNT)]).astype(np.int32)
+    rng = np.random.default_rng(5)
+    table = np.stack([rng.permutation(PAIRS)[:3] for _ in range(COUNT)]).astype(np.int32)
     threshold = 0.05 if relative else 0.01
     twin = reference.consensus(source, target, weight, threshold, table, refits=2, rank=rank, relative=relative)
-    found = solve(source, target, weight, threshold, sets=jnp.asarray(table), keep=1, rank=rank, relative=relative)
+    found = solve(source, target, weight, threshold, sets=jnp.asarray(table), rank=rank, relative=relative)
     np.testing.assert_allclose(found.score[0], twin[3], atol=1e-5)
     np.testing.assert_allclose(found.rotation[0], twin[0], atol=1e-4)
     np.testing.assert_allclose(found.translation[0], twin[1], atol=1e-4)
@@ -217,30 +220,25 @@ def test_drawn_in_proportion():
     np.testing.assert_allclose(np.bincount(ours[:, 0], minlength=7) / 20000, weight / 20, atol=0.015)
 
 
-def test_vmap_equals_loop_and_eager():
+def test_vmap_equals_loop():
     problems = [problem(seed, 0.4, noise=0.005)[:3] for seed in range(2)]
     stacked = [jnp.stack(x) for x in zip(*problems, strict=True)]
-    keys = jax.random.split(jax.random.key(0), 2)
-
-    def one(key, source, target, weight):
-        return consensus(key, source, target, weight, 0.02, count=64, keep=2, refits=1, relative=True)
-
-    batched = jax.jit(jax.vmap(one))(keys, *stacked)
-    single = jax.jit(one)(keys[1], *problems[1])
-    with jax.disable_jit():
-        eager = one(keys[1], *problems[1])
-    for other in (jax.tree.map(lambda x: x[1], batched), eager):
-        np.testing.assert_allclose(single.score, other.score, atol=1e-5)
-        np.testing.assert_allclose(single.rotation[0], other.rotation[0], atol=1e-4)
+    batched = jax.vmap(lambda *arrays: solve(*arrays, key=3))(*stacked)
+    for i, arrays in enumerate(problems):
+        single = solve(*arrays, key=3)
+        np.testing.assert_allclose(single.score, batched.score[i], atol=1e-5)
+        np.testing.assert_allclose(single.rotation[0], batched.rotation[i, 0], atol=1e-4)
+        np.testing.assert_array_equal(single.inliers[0], batched.inliers[i, 0])
 
 
 def test_one_trace_for_all_thresholds():
     arguments = problem(0, 0.5)[:3]
+    solve(*arguments)
     before = consensus._cache_size()
     for threshold in (0.01, 0.03):
         for bound in (0.1, 0.15):
-            solve(*arguments, threshold, key=1, scale_bounds=(jnp.float32(bound), jnp.float32(1)), count=32)
-    assert consensus._cache_size() == before + 1
+            solve(*arguments, threshold, key=1, scale_bounds=(bound, 1.0), edge_ratio=bound, spread=bound / 2)
+    assert consensus._cache_size() == before
 
 
 def test_lowered_text_calls_no_library():
