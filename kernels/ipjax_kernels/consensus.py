@@ -123,7 +123,8 @@ def consensus(
 
     ``count`` minimal sets of ``size`` pairs are drawn in proportion to the weights (or given: ``sets``, indices
     (n, m)), a similarity is fitted to each, and all pairs judge it. The best are fitted again to their inliers,
-    ``refits`` times, and keep the better of the two, so a score never falls.
+    ``refits`` times, and keep the better of the two, so a score never falls
+    (by more than rounding).
 
     ``threshold`` is the distance below which a pair is an inlier, in target units; with ``relative`` a fraction of the
     hypothesis's own scale (the object's diameter, if the source has unit diameter). ``rank``: "msac" = the truncated
@@ -186,7 +187,9 @@ def consensus(
         fitted = fit_batch_last(source[:, :, None], target[:, :, None], jnp.where(inliers, weight, 0).T)
         rotation, translation = jnp.moveaxis(fitted[0], -1, 0), jnp.moveaxis(fitted[1], -1, 0)
         new_score, new_loss, _, allowed = judge(rotation, translation, fitted[2], fitted[4] & success)
-        better = allowed & ((new_score > score) | ((new_score == score) & (new_loss < loss)))
+        # Sums of the same weights in another order may differ in the last digit; the loss decides then.
+        tied = jnp.abs(new_score - score) <= 8 * jnp.finfo(score.dtype).eps
+        better = allowed & jnp.where(tied, new_loss < loss, new_score > score)
         new = (rotation, translation, fitted[2], new_score, new_loss, success)
         return tuple(
             jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
