@@ -101,9 +101,9 @@ start here:
 
 Everything is in metres and OpenCV camera axes (x right, y down, z ahead) unless a name says otherwise.""",
     )
-    import ipjax
+    from ipjax import __version__
 
-    parser.add_argument("--version", action="version", version=f"ipjax {ipjax.__version__}")
+    parser.add_argument("--version", action="version", version=f"ipjax {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=_Parser)
     _add_onboard(commands)
     _add_estimate(commands)
@@ -113,6 +113,7 @@ Everything is in metres and OpenCV camera axes (x right, y down, z ahead) unless
     _add_score(commands)
     _add_evaluate(commands)
     _add_degrade(commands)
+    _add_export(commands)
     return parser
 
 
@@ -750,6 +751,43 @@ def _degrade(arguments: argparse.Namespace) -> int:
     if arguments.alignment is not None:
         write_text(arguments.alignment, to_json(alignment.as_json()))
     print(f"{output}: level {arguments.level}")
+    return 0
+
+
+# --- export -----------------------------------------------------------------------------------------------------------
+
+
+def _add_export(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "export",
+        _export,
+        "write the whole estimate as StableHLO, which runs without ipjax on CPU, CUDA and TPU",
+        """\
+The artifact takes dictionaries of arrays; templates are inputs, so it serves every object of the same shapes.
+Its inputs and outputs are told in a JSON file beside it.
+
+examples:
+  ipjax export mug.ipjax -o estimate.stablehlo
+  ipjax export mug.ipjax -o estimate16.stablehlo --batch 16
+""",
+    )
+    parser.add_argument("object", metavar="OBJ", type=Path, help="an object file: its shapes are exported, not its content")
+    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True)
+    parser.add_argument("--batch", type=_positive, help="queries at once (default: one, without a batch axis)")
+    parser.add_argument("--config", choices=("default", "paper"), default="default")
+
+
+def _export(arguments: argparse.Namespace) -> int:
+    from ipjax.config import Config
+    from ipjax.host.exporting import blank_query, export
+    from ipjax.host.objects import load
+
+    output = _check_output(arguments.output, (".stablehlo",))
+    templates, info = load(arguments.object)
+    config = Config.paper() if arguments.config == "paper" else Config()
+    export(templates, blank_query(templates, info.resolution), output, config, batch=arguments.batch)
+    print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; its inputs and outputs: {output}.json")
     return 0
 
 

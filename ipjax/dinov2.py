@@ -90,7 +90,7 @@ def _cubic(x: np.ndarray, a: float) -> np.ndarray:
     return np.where(x <= 1, near, np.where(x < 2, far, 0.0))
 
 
-def resize_weights(size: int, native: int, *, antialias: bool, offset: float) -> np.ndarray:
+def resize_weights(size: int, native: int, *, antialias: bool, offset: float) -> Float[np.ndarray, "size native"]:
     """The matrix [size, native] that resizes one axis as the official code (PyTorch's bicubic interpolation) does.
 
     Without antialiasing: a = −¾, the scale is (size + offset) / native rather than size / native, and samples beyond

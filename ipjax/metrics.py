@@ -26,8 +26,8 @@ ADD_LIMIT = 0.1  # metres: where the area under the accuracy-threshold curve of 
 
 
 def discretise_symmetries(
-    discrete: Sequence[np.ndarray] = (),
-    continuous: Sequence[tuple[np.ndarray, np.ndarray]] = (),
+    discrete: Sequence[Float[np.ndarray, "4 4"]] = (),
+    continuous: Sequence[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]] = (),
     step: float = SYMMETRY_STEP,
 ) -> tuple[Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3"]]:
     """All symmetry transforms of an object as rotations [s, 3, 3] and translations [s, 3], float64; the first is the

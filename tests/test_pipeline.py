@@ -1,5 +1,7 @@
 """The whole estimate on problems with known answers: laws, contracts, and what a bad input does. One tiny shape."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,9 +19,17 @@ TINY = Config(
     match=MatchConfig(views=2, pairs=64),
     align=AlignConfig(count=128),
     refine=RefineConfig(steps=4, points=96),
-    score=ScoreConfig(resolution=28),
+    score=ScoreConfig(resolution=28, alternates=0),
 )
-estimate = jax.jit(ipjax.estimate)
+TURNED = dataclasses.replace(TINY, score=ScoreConfig(resolution=28, alternates=1))
+TRACES = []
+
+
+@jax.jit
+def estimate(templates, query, key, config, diameter=None):
+    """Compiled once for each of the configurations above, not once per test."""
+    TRACES.append(config)
+    return ipjax.estimate(templates, query, key, config, diameter=diameter)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +64,7 @@ def test_recovers_pose_and_size(templates, seed):
 
 def test_a_known_size_is_kept(templates):
     query, truth = problems.make_query(1)
-    found = estimate(templates, query, jax.random.key(0), TINY, diameter=truth.scale)
+    found = estimate(templates, query, jax.random.key(0), TURNED, truth.scale)
     np.testing.assert_allclose(found.camera_from_object.scale, truth.scale, rtol=1e-6)
     assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.1 * float(truth.scale)
 
@@ -78,23 +88,20 @@ def test_vmap_over_queries_equals_the_loop(templates):
 
 
 def test_one_trace_for_all_thresholds_and_keys(templates):
-    traces = []
-
-    @jax.jit
-    def run(query, key, config):
-        traces.append(1)
-        return ipjax.estimate(templates, query, key, config).view
-
     query, _ = problems.make_query(5)
-    run(query, jax.random.key(0), TINY)
-    looser = eqx.tree_at(lambda c: (c.align.threshold, c.match.cycle, c.score.tolerance), TINY, (0.1, 2.0, 0.05))
-    run(problems.make_query(6)[0], jax.random.key(1), looser)
-    assert len(traces) == 1
+    one = estimate(templates, query, jax.random.key(0), TINY)
+    traces = len(TRACES)
+    leaves, structure = jax.tree.flatten(TINY)
+    other = jax.tree.unflatten(structure, [leaf * 1.1 for leaf in leaves])  # every threshold at once
+    moved = estimate(templates, problems.make_query(6)[0], jax.random.key(1), other)
+    assert len(leaves) > 5
+    assert len(TRACES) == traces
+    assert float(one.rmse) != float(moved.rmse)
 
 
 def test_the_graph_has_no_callback_and_no_lapack(templates):
-    query, _ = problems.make_query(0)
-    text = jax.jit(ipjax.estimate).lower(templates, query, jax.random.key(0), TINY).as_text()
+    query, truth = problems.make_query(0)
+    text = estimate.lower(templates, query, jax.random.key(0), TURNED, truth.scale).as_text()
     assert "callback" not in text and "lapack" not in text and "cusolver" not in text
     assert text.count("stablehlo") > 100  # it is the graph that was searched
 
@@ -104,10 +111,10 @@ def test_scaling_the_object_scales_nothing_but_the_scale(templates):
     query, _ = problems.make_query(8)
     half = eqx.tree_at(lambda t: t.patches.points, templates, templates.patches.points / 2)
     one = ipjax.Config.paper()
-    full = jax.jit(ipjax.estimate)(templates, query, jax.random.key(0), one).camera_from_object
+    full = estimate(templates, query, jax.random.key(0), one).camera_from_object
     # The paper's threshold is relative to the diameter, so it doubles with the model's unit.
     doubled = eqx.tree_at(lambda c: c.align.threshold, one, one.align.threshold / 2)
-    small = jax.jit(ipjax.estimate)(half, query, jax.random.key(0), doubled).camera_from_object
+    small = estimate(half, query, jax.random.key(0), doubled).camera_from_object
     np.testing.assert_allclose(small.scale, 2 * full.scale, rtol=1e-3)
     np.testing.assert_allclose(small.translation, full.translation, atol=1e-3)
 
@@ -124,6 +131,6 @@ def test_nothing_to_match_is_reported_in_numbers(templates):
 
 def test_paper_runs_without_refinement(templates):
     query, truth = problems.make_query(9)
-    found = jax.jit(ipjax.estimate)(templates, query, jax.random.key(0), Config.paper())
+    found = estimate(templates, query, jax.random.key(0), Config.paper())
     assert bool(found.success)
     assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.3 * float(truth.scale)

@@ -15,10 +15,10 @@ _PACKAGES = ("jax", "jaxlib", "flax", "equinox", "optimistix", "mujoco", "trimes
 
 def examine() -> Iterator[Line]:
     """One line for each thing looked at, in the order in which they are needed; nothing raises."""
-    import ipjax
+    from ipjax import __version__
 
     system = f"{platform.system()} {platform.machine()}"
-    yield True, "ipjax", f"{ipjax.__version__}, Python {sys.version.split()[0]} on {system}"
+    yield True, "ipjax", f"{__version__}, Python {sys.version.split()[0]} on {system}"
     for name in _PACKAGES:
         try:
             yield True, name, importlib.metadata.version(name)

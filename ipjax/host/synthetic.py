@@ -42,7 +42,7 @@ class Sensor:
     blur: float = 0.6  # of the photo, pixels
 
 
-PERFECT = Sensor(0, 0, 0, 0, 0, 0, 0, 0, 0)
+PERFECT = Sensor(*[0.0] * 9)
 
 
 @dataclasses.dataclass(frozen=True)

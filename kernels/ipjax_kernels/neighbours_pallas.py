@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as plgpu
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 _CHANNELS = 128  # channels per product: Triton's tiles are powers of two, and 384 is not
 
@@ -22,7 +22,7 @@ def search(
     dtype: jnp.dtype | type = jnp.float32,
     block: int = 128,
     interpret: bool = False,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Int[Array, "v p"], Float[Array, "v p"], Int[Array, "v q"], Float[Array, "v q"]]:
     """Indices and similarities, query to template and template to query; unmatched entries are not defined.
 
     ``interpret`` runs the kernel's steps as ordinary JAX operations, on any device, slowly: for tests.
