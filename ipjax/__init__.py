@@ -3,34 +3,45 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ipjax.config import AlignConfig as AlignConfig
-from ipjax.config import Config as Config
-from ipjax.config import DescribeConfig as DescribeConfig
-from ipjax.config import MatchConfig as MatchConfig
-from ipjax.config import OnboardConfig as OnboardConfig
-from ipjax.config import RefineConfig as RefineConfig
-from ipjax.config import ScoreConfig as ScoreConfig
-from ipjax.features import describe as describe
-from ipjax.features import observe as observe
-from ipjax.pipeline import estimate as estimate
-from ipjax.types import Camera as Camera
-from ipjax.types import Patches as Patches
-from ipjax.types import PoseEstimate as PoseEstimate
-from ipjax.types import Query as Query
-from ipjax.types import Similarity as Similarity
-from ipjax.types import Surface as Surface
-from ipjax.types import Templates as Templates
-from ipjax.types import View as View
+from ipjax.config import AlignConfig, Config, DescribeConfig, MatchConfig, OnboardConfig, RefineConfig, ScoreConfig
+from ipjax.features import describe, observe
+from ipjax.pipeline import estimate
+from ipjax.types import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
 
 if TYPE_CHECKING:
-    from ipjax.host.drawing import draw as draw
-    from ipjax.host.frames import frame as frame
-    from ipjax.host.objects import load as load
-    from ipjax.host.objects import save as save
-    from ipjax.host.onboarding import onboard as onboard
-    from ipjax.host.weights import load_encoder as load_encoder
+    from ipjax.host.drawing import draw
+    from ipjax.host.frames import frame
+    from ipjax.host.objects import load, save
+    from ipjax.host.onboarding import onboard
+    from ipjax.host.weights import load_encoder
 
 __version__ = "0.1.0"
+__all__ = [
+    "AlignConfig",
+    "Camera",
+    "Config",
+    "DescribeConfig",
+    "MatchConfig",
+    "OnboardConfig",
+    "Patches",
+    "PoseEstimate",
+    "Query",
+    "RefineConfig",
+    "ScoreConfig",
+    "Similarity",
+    "Surface",
+    "Templates",
+    "View",
+    "describe",
+    "draw",
+    "estimate",
+    "frame",
+    "load",
+    "load_encoder",
+    "observe",
+    "onboard",
+    "save",
+]
 
 # What needs OpenCV, MuJoCo or files is imported when it is first used.
 _HOST = {
