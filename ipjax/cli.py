@@ -95,7 +95,7 @@ def _parser() -> argparse.ArgumentParser:
 start here:
   ipjax doctor                               what works on this machine
   ipjax weights fetch                        get the encoder's weights, once
-  ipjax onboard mug.glb -o mug.ipjax         once per object: a mesh becomes templates
+  ipjax onboard mug.glb -o mug.ipjax         once per object: a mesh, or one photo, becomes templates
   ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png \\
       -o pose.json --overlay pose.png        once per frame: where is it, and how large
 
@@ -137,64 +137,134 @@ def _add_onboard(commands: Any) -> None:
         commands,
         "onboard",
         _onboard,
-        "make an object file from a mesh: render it from everywhere and describe every view",
+        "make an object file from a mesh or from one photo: see it from everywhere and describe every view",
         """\
 examples:
   ipjax onboard mug.glb -o mug.ipjax
   ipjax onboard scan.ply -o scan.ipjax --unit mm           the mesh's unit is known: sizes are compared in the result
   ipjax onboard part.stl -o part.ipjax --directions 20     half the templates: faster, less accurate
+  ipjax onboard mug.jpg --mask mug_mask.png -o mug.ipjax --report mug.html
+  ipjax onboard mug.jpg --box 210,130,90,120 -o mug.ipjax  the mask is cut out inside the box
+  ipjax onboard rgb.png --mask mask.png --depth depth.png --camera camera.json --depth-scale 0.001 -o mug.ipjax
+                                                           the front is measured, and so is the size
 
 The mesh may be a scan, CAD, or what a single-view reconstruction made: in any frame and unit, coloured by a texture or
-by vertices.
+by vertices. A photo becomes a mesh by TripoSR where its weights are, else without learned weights: its outline is
+inflated, or its depth completed. The report shows what was seen and what was guessed.
 """,
     )
-    parser.add_argument("mesh", metavar="MESH", type=Path, help="OBJ, PLY, GLB, glTF or STL")
+    parser.add_argument("source", metavar="SOURCE", type=Path, help="mesh (OBJ, PLY, GLB, glTF, STL) or photo")
     parser.add_argument(
         "-o", "--output", metavar="OBJ.ipjax", type=Path, required=True, help="the object file to write"
     )
-    parser.add_argument("--name", help="of the object (default: the mesh file's)")
-    parser.add_argument("--unit", choices=("m", "cm", "mm", "inch"), help="of the mesh file, if known; never guessed")
+    parser.add_argument("--report", type=Path, metavar="HTML", help="a page of what was made; needs nothing beside it")
+    parser.add_argument("--name", help="of the object (default: the file's)")
+    parser.add_argument("--unit", choices=tuple(_UNITS), help="of the mesh file, if known; never guessed")
     parser.add_argument("--directions", type=_positive, metavar="N", help="viewpoints on the sphere (default 40)")
     parser.add_argument("--rolls", type=_positive, metavar="N", help="in-plane rotations of each (default 10)")
     parser.add_argument("--backend", default="auto", help="renderer: auto, egl, osmesa, native or raster")
     _add_encoder(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bars, no notes")
+    photo = parser.add_argument_group("photos")
+    photo.add_argument("--mask", type=Path, metavar="FILE", help="the object (default: transparency, plain background)")
+    photo.add_argument("--box", type=_numbers, metavar="X,Y,W,H", help="cut the object out inside this box, pixels")
+    photo.add_argument("--click", type=_numbers, metavar="X,Y", help="cut out the object at this pixel")
+    photo.add_argument("--depth", type=Path, metavar="FILE", help="depth aligned to the photo: metric front and size")
+    photo.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
+    photo.add_argument("--image", type=int, metavar="ID", help="which image of a BOP scene_camera.json")
+    photo.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
+    photo.add_argument("--lrm", choices=("triposr", "inflate", "auto"), help="who makes the mesh (default auto)")
+    photo.add_argument("--lrm-weights", type=Path, metavar="FILE", help="TripoSR's checkpoint")
+    photo.add_argument("--save-mesh", type=Path, metavar="GLB", help="also write the reconstructed mesh")
 
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+_PHOTO_ONLY = ("mask", "box", "click", "depth", "camera", "image", "depth_scale", "lrm", "lrm_weights", "save_mesh")
 
 
 def _onboard(arguments: argparse.Namespace) -> int:
     output = _check_output(arguments.output, (".ipjax",))
-    if not arguments.mesh.is_file():
-        raise ValueError(f"{arguments.mesh}: no such mesh file")
+    source = arguments.source
+    if not source.is_file():
+        raise ValueError(f"{source}: no such file")
+    is_photo = source.suffix.lower() in _IMAGES
+    for name in _PHOTO_ONLY if not is_photo else ("unit",):
+        if getattr(arguments, name) is not None:
+            other = "a mesh" if not is_photo else "a photo"
+            raise ValueError(f"{source}: --{name.replace('_', '-')} does not belong to {other}")
+    if arguments.report is not None:
+        _check_output(arguments.report, (".html", ".htm"))
+    if arguments.save_mesh is not None:
+        _check_output(arguments.save_mesh, (".glb", ".obj", ".ply", ".stl"))
     from ipjax.config import OnboardConfig
-    from ipjax.host.onboarding import onboard
 
-    _use_cache()
     config = OnboardConfig(**{k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None})
-    encoder = _load_encoder(arguments)
     start = time.perf_counter()
-    templates, info = onboard(
-        arguments.mesh,
-        encoder,
-        config,
-        out=output,
-        name=arguments.name,
-        metres_per_unit=None if arguments.unit is None else _UNITS[arguments.unit],
-        progress=not arguments.quiet,
-        backend=arguments.backend,
-    )
+    options: dict[str, Any] = {
+        "out": output,
+        "name": arguments.name,
+        "progress": not arguments.quiet,
+        "backend": arguments.backend,
+    }
+    photo = None
+    if is_photo:
+        from ipjax.host.photos import onboard_photo, take_shot
+
+        given = {name: getattr(arguments, name) for name in ("mask", "box", "click", "depth", "depth_scale")}
+        given["camera"] = _read_photo_camera(arguments)
+        given["tried"] = output.with_suffix(".tried.png")
+        take_shot(source, **given)  # a bad photo is refused before weights are loaded and anything is compiled
+        encoder = _load_encoder(arguments)
+        _use_cache()
+        lrm = {"lrm": arguments.lrm or "auto", "lrm_weights": arguments.lrm_weights}
+        photo = onboard_photo(source, encoder, config, **given, **lrm, **options)
+        templates, info = photo.templates, photo.info
+        if arguments.save_mesh is not None:
+            from ipjax.host.meshes import save_mesh
+
+            save_mesh(photo.reconstruction.mesh, arguments.save_mesh)
+    else:
+        from ipjax.host.onboarding import onboard
+
+        encoder = _load_encoder(arguments)
+        _use_cache()
+        unit = None if arguments.unit is None else _UNITS[arguments.unit]
+        templates, info = onboard(source, encoder, config, metres_per_unit=unit, **options)
+    warned: tuple[str, ...] = ()
+    if arguments.report is not None:
+        from ipjax.host.meshes import clean, load_mesh, normalise
+        from ipjax.host.onboarding_report import examine, write_report
+
+        mesh = normalise(clean(load_mesh(source) if photo is None else photo.reconstruction.mesh)[0])
+        found = examine(templates, info, mesh, encoder, config, backend=arguments.backend)
+        write_report(arguments.report, templates, info, mesh, found, photo, backend=arguments.backend)
+        warned = found.warnings
     if not arguments.quiet:
         arguments.notes.tell()
         for note in info.notes:
             print(f"note: {note}")
+        for warning in warned:
+            print(f"warning: {warning}")
         size = 1 / info.mesh_scale
         unit = f"{size * 1e3 * info.metres_per_unit:.1f} mm" if info.metres_per_unit else f"{size:g} mesh units"
+        unit = "unknown" if is_photo and not info.metres_per_unit else unit
         count = len(templates.camera_from_object.scale)
         seconds = time.perf_counter() - start
         print(f"{output}: {count} templates of {info.name}, diameter {unit}, in {seconds:.0f} s")
+        if arguments.report is not None:
+            print(f"{arguments.report}: what was made of it")
     return 0
+
+
+def _read_photo_camera(arguments: argparse.Namespace) -> Any:
+    if arguments.camera is None:
+        return None
+    from ipjax.host.images import read_camera
+
+    image = arguments.image
+    if image is None and arguments.source.stem.isdigit():
+        image = int(arguments.source.stem)
+    return read_camera(_camera_source(arguments.camera), image)
 
 
 # --- estimate ---------------------------------------------------------------------------------------------------------
@@ -220,6 +290,8 @@ camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine nu
 
 Depth of whole numbers needs a unit: --depth-scale 0.001 for millimetres, unless the camera file has BOP's depth_scale.
 The pose in the JSON maps the coordinates of your mesh file to camera metres; every frame and unit is named there.
+For an object made from a photo it also has the pose relative to that photo. Where that photo had depth, the size it
+measured is kept; --size says another, --free-size lets it be found.
 """,
     )
     parser.add_argument("objects", metavar="OBJ.ipjax", type=Path, nargs="+", help="object files, from 'ipjax onboard'")
@@ -233,7 +305,10 @@ The pose in the JSON maps the coordinates of your mesh file to camera metres; ev
     parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
     parser.add_argument("--image", type=int, metavar="ID", help="which image of a BOP scene_camera.json")
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
-    parser.add_argument("--diameter", type=float, metavar="METRES", help="the object's true diameter, if known")
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--size", type=float, metavar="MM", help="the object's true diameter in millimetres, if known")
+    size.add_argument("--diameter", type=float, metavar="METRES", help="the same in metres")
+    size.add_argument("--free-size", action="store_true", help="find the size even where the reference photo told it")
     parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
     parser.add_argument("--method", choices=("best", "paper"), default="best", help="settings (default: best)")
     parser.add_argument("--seed", type=int, default=0, help="same seed, same answer (default 0)")
@@ -252,6 +327,10 @@ def _estimate(arguments: argparse.Namespace) -> int:
         _check_output(arguments.overlay, (".png", ".jpg", ".jpeg"))
     elif arguments.overlay is not None and arguments.overlay.exists() and not arguments.overlay.is_dir():
         raise ValueError(f"{arguments.overlay}: with --frames, the overlay is a folder")
+    if arguments.size is not None:
+        if not 1 <= arguments.size < 1e5:
+            raise ValueError(f"--size is in millimetres; {arguments.size:g} cannot be right")
+        arguments.diameter = 1e-3 * arguments.size
     if arguments.diameter is not None and not 1e-4 < arguments.diameter < 100:
         raise ValueError(f"--diameter is in metres; {arguments.diameter:g} cannot be right")
     if not 0 <= arguments.seed < 2**32:
@@ -287,6 +366,11 @@ def _estimate(arguments: argparse.Namespace) -> int:
 
     config = Config.paper() if arguments.method == "paper" else Config()
     estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
+    # A reference photo with depth has measured the size; else it is free, unless the user knows it.
+    diameters = [
+        arguments.diameter if arguments.diameter is not None or arguments.free_size else info.measured_diameter
+        for _, info in objects
+    ]
     told, failed = [], 0
     for names in frames:
         try:
@@ -299,7 +383,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
                 )
                 crops.append((crop, time.perf_counter() - start))
             for i, (crop, seconds) in enumerate(crops):
-                result = estimator.run(i, *crop, seed=arguments.seed, diameter=arguments.diameter)
+                result = estimator.run(i, *crop, seed=arguments.seed, diameter=diameters[i])
                 results.append((result, {"frame": seconds} | result.seconds))
         except (ValueError, OSError) as error:
             if not many:
@@ -316,8 +400,9 @@ def _estimate(arguments: argparse.Namespace) -> int:
             "objects": [
                 {"object_file": str(path)}
                 | tell_estimate(result.estimate, result.templates, result.info)
+                | {"size_given_mm": None if diameter is None else 1e3 * diameter}
                 | {"stage_seconds": {name: round(value, 6) for name, value in seconds.items()}}
-                for path, (result, seconds) in zip(arguments.objects, results, strict=True)
+                for path, diameter, (result, seconds) in zip(arguments.objects, diameters, results, strict=True)
             ],
         }
         if arguments.overlay is not None:
@@ -772,7 +857,9 @@ examples:
   ipjax export mug.ipjax -o estimate16.stablehlo --batch 16
 """,
     )
-    parser.add_argument("object", metavar="OBJ", type=Path, help="an object file: its shapes are exported, not its content")
+    parser.add_argument(
+        "object", metavar="OBJ", type=Path, help="an object file: its shapes are exported, not its content"
+    )
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True)
     parser.add_argument("--batch", type=_positive, help="queries at once (default: one, without a batch axis)")
     parser.add_argument("--config", choices=("default", "paper"), default="default")
@@ -801,6 +888,14 @@ def _positive(text: str) -> int:
     return value
 
 
+def _numbers(text: str) -> tuple[float, ...]:
+    values = tuple(float(part) for part in text.split(","))
+    if any(value != value or abs(value) == float("inf") for value in values):
+        raise ValueError
+    return values
+
+
+_numbers.__name__ = "list of numbers"
 _positive.__name__ = "count"  # argparse names the type in its message
 
 

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ipjax.alignment import align
 from ipjax.config import Config
@@ -52,27 +52,10 @@ def estimate(
     parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
     if config.score.ranking == "render":
         scene = _Scene(query, config.score.resolution)
-        judge = lambda poses: _improve_and_score(
-            templates, query, scene, poses, config, scale_known=diameter is not None
+        poses, parent, determined, agreement = _rounds(
+            templates, query, scene, (poses, parent, determined), config, scale_known=diameter is not None
         )
-        poses, agreement = judge(poses)
-        agreement = jnp.where(determined, agreement, -1)
-        if config.score.alternates:
-            with jax.named_scope("alternates"):
-                agreement, order = lax.top_k(agreement, agreement.shape[0])
-                poses, parent, determined = jax.tree.map(lambda x: x[order], (poses, parent, determined))
-                turned = turn(jax.tree.map(lambda x: x[: config.score.alternates], poses), templates.axes)
-                turns = turned.scale.shape[0] // config.score.alternates
-                again = lambda x: jnp.repeat(x[: config.score.alternates], turns, axis=0)
-                turned, other = judge(turned)
-                other = jnp.where(again(determined), other, -1)
-                poses = jax.tree.map(lambda *x: jnp.concatenate(x), poses, turned)
-                agreement, parent, determined = (
-                    jnp.concatenate(x)
-                    for x in ((agreement, other), (parent, again(parent)), (determined, again(determined)))
-                )
-    else:
-        agreement = jnp.where(determined, agreement, -1)
+    agreement = jnp.where(determined, agreement, -1)
     agreement, order = lax.top_k(agreement, agreement.shape[0])
     poses, parent, determined = jax.tree.map(lambda x: x[order], (poses, parent, determined))
     answer: Similarity = jax.tree.map(lambda x: x[0], poses)
@@ -110,6 +93,47 @@ class _Scene(eqx.Module):
         self.mask = query.view.mask[nearest[:, None], nearest]
 
 
+def _rounds(
+    templates: Templates,
+    query: Query,
+    scene: _Scene,
+    first: tuple[Similarity, Int[Array, "h"], Bool[Array, "h"]],
+    config: Config,
+    *,
+    scale_known: bool,
+) -> tuple[Similarity, Int[Array, "n"], Bool[Array, "n"], Float[Array, "n"]]:
+    """Refine and score the hypotheses; then do the same with the best of them turned about the box's axes.
+
+    Both rounds are one body of a scan, so that refinement is compiled once; the shorter one is padded with copies.
+    """
+    turned = config.score.alternates
+    count = max(first[2].shape[0], TURNS * turned)
+    pad = lambda x: jnp.concatenate([x, jnp.repeat(x[:1], count - x.shape[0], axis=0)])
+
+    absent = lambda flags: jnp.pad(flags, (0, count - flags.shape[0]))  # copies are no hypotheses of their own
+    poses, parent, determined = first
+
+    def one_round(given, _):
+        poses, parent, determined = given
+        poses, score = _improve_and_score(templates, query, scene, poses, config, scale_known=scale_known)
+        score = jnp.where(determined, score, -1)
+        if not turned:
+            return given, (poses, parent, determined, score)
+        best = lax.top_k(score, turned)[1]
+        again = lambda x: pad(jnp.repeat(x[best], TURNS, axis=0))
+        alternates = jax.tree.map(pad, turn(jax.tree.map(lambda x: x[best], poses), templates.axes))
+        return (alternates, again(parent), absent(jnp.repeat(determined[best], TURNS))), (
+            poses,
+            parent,
+            determined,
+            score,
+        )
+
+    start = (jax.tree.map(pad, poses), pad(parent), absent(determined))
+    _, found = lax.scan(one_round, start, None, length=2 if turned else 1)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
+
+
 def _improve_and_score(
     templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config, *, scale_known: bool
 ) -> tuple[Similarity, Float[Array, "h"]]:
@@ -121,6 +145,9 @@ def _improve_and_score(
         camera = scene.cloud.camera
         rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score)
         return poses, jax.vmap(rate)(poses)
+
+
+TURNS = 9  # of one pose: a quarter, half and three quarters about each of three axes
 
 
 def turn(poses: Similarity, axes: Float[Array, "3 3"]) -> Similarity:

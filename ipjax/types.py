@@ -112,7 +112,7 @@ class PoseEstimate(eqx.Module):
     """The answer, and what it rests on."""
 
     camera_from_object: Similarity  # metres from model units; the scale is the object's diameter in metres
-    confidence: Float[Array, "*b"]  # [0, 1]
+    confidence: Float[Array, "*b"]  # [0, 1]: how much of what is seen the pose explains; not a calibrated probability
     hypotheses: Hypotheses  # the alternatives, the answer first
     view: Int[Array, "*b"]  # the template whose pairs led to the answer
     view_score: Float[Array, "*b v"]  # of every template; higher is better
