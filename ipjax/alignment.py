@@ -13,7 +13,7 @@ def align(
     pairs: Pairs,
     size: Float[Array, "v"],
     key: PRNGKeyArray,
-    config: AlignConfig = AlignConfig(),  # noqa: B008
+    config: AlignConfig = AlignConfig(),
     *,
     diameter: Float[Array, ""] | None = None,
 ) -> tuple[Similarity, Float[Array, "h"], Bool[Array, "h k"], Bool[Array, "h"]]:

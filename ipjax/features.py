@@ -13,7 +13,7 @@ from ipjax.types import Patches, Query, View
 def describe(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
     view: View,
-    config: DescribeConfig = DescribeConfig(),  # noqa: B008 (a frozen record)
+    config: DescribeConfig = DescribeConfig(),
 ) -> Patches:
     """Encode a view and lift its patches.
 
@@ -45,7 +45,7 @@ def describe(
 def observe(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
     view: View,
-    config: DescribeConfig = DescribeConfig(),  # noqa: B008
+    config: DescribeConfig = DescribeConfig(),
 ) -> Query:
     """``describe`` a crop of the scene and keep the crop beside its patches, as ``estimate`` takes it.
 

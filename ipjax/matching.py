@@ -10,7 +10,7 @@ from ipjax.config import MatchConfig
 from ipjax.types import Matches, Pairs, Patches, Templates
 
 
-def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfig()) -> Matches:  # noqa: B008
+def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfig()) -> Matches:
     """Nearest neighbours both ways, cyclic distances, and the templates ranked by them.
 
     The cycle starts at the query (Eq. 2–4); masks enter before every argmax. ``ranking='cyclic'`` is Eq. 5, the sum
@@ -75,7 +75,7 @@ def select(
     matches: Matches,
     query: Patches,
     templates: Templates,
-    config: MatchConfig = MatchConfig(),  # noqa: B008
+    config: MatchConfig = MatchConfig(),
 ) -> Pairs:
     """Lift matches to pairs of 3-D points, ``[v k]``; the weight falls with the cycle and rises with the cosine."""
     points = templates.patches.points[matches.view]

@@ -20,7 +20,7 @@ def estimate(
     templates: Templates,
     query: Query,
     key: PRNGKeyArray,
-    config: Config = Config(),  # noqa: B008
+    config: Config = Config(),
     *,
     diameter: Float[Array, ""] | None = None,
 ) -> PoseEstimate:

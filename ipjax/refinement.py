@@ -31,7 +31,7 @@ def refine(
     surface: Surface,
     cloud: Cloud,
     camera_from_object: Similarity,
-    config: RefineConfig = RefineConfig(),  # noqa: B008
+    config: RefineConfig = RefineConfig(),
     *,
     scale_known: bool = False,
 ) -> tuple[Similarity, Float[Array, ""]]:

@@ -22,7 +22,7 @@ def score(
     mask: Bool[Array, "g g"],
     camera: Camera,
     camera_from_object: Similarity,
-    config: ScoreConfig = ScoreConfig(),  # noqa: B008
+    config: ScoreConfig = ScoreConfig(),
 ) -> Float[Array, ""]:
     """The score in [0, 1] of one hypothesis; the caller vmaps.
 
@@ -41,7 +41,7 @@ def depth_agreement(
     mask: Bool[Array, "g g"],
     camera: Camera,
     camera_from_object: Similarity,
-    config: ScoreConfig = ScoreConfig(),  # noqa: B008
+    config: ScoreConfig = ScoreConfig(),
 ) -> Float[Array, ""]:
     """Share of what is seen of the object or its mask where predicted and measured depth agree.
 
@@ -91,7 +91,7 @@ def feature_agreement(
     templates: Templates,
     query: Query,
     camera_from_object: Similarity,
-    config: ScoreConfig = ScoreConfig(),  # noqa: B008
+    config: ScoreConfig = ScoreConfig(),
 ) -> Float[Array, ""]:
     """Cosine in [0, 1] between the patches of the nearest templates, moved by the hypothesis, and the query there.
 

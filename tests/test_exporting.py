@@ -27,7 +27,8 @@ def nest(prefix):
                 node = node.setdefault(part, {})
             node[rest[-1]] = value
     return tree
-found = export.deserialize(bytearray(open(sys.argv[1], "rb").read())).call(nest("templates"), nest("query"), flat["key"])
+artifact = export.deserialize(bytearray(open(sys.argv[1], "rb").read()))
+found = artifact.call(nest("templates"), nest("query"), flat["key"])
 assert "ipjax" not in sys.modules and "ipjax_kernels" not in sys.modules
 pose = found["camera_from_object"]
 np.savez(sys.argv[3], **pose, view=found["view"])

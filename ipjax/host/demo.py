@@ -46,7 +46,7 @@ class Comparison:
         return self.adds < GOOD
 
 
-def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Config = Config()) -> bool:  # noqa: B008
+def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Config = Config()) -> bool:
     """Make a scene, onboard a distorted and rescaled copy of one of its objects, find it, compare with the truth.
 
     Args:

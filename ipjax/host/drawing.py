@@ -44,7 +44,7 @@ def gather_evidence(
     query: Query,
     estimate: PoseEstimate,
     info: ObjectInfo,
-    config: Config = Config(),  # noqa: B008 (a frozen record)
+    config: Config = Config(),
 ) -> Evidence:
     """Match the query once more with the chosen template alone, and see which pairs the pose explains."""
     view = int(estimate.view)

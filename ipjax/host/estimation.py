@@ -43,7 +43,7 @@ class Estimator:
         self,
         objects: Sequence[tuple[Templates, ObjectInfo]],
         encoder: Any,
-        config: Config = Config(),  # noqa: B008 (a frozen record)
+        config: Config = Config(),
         **options: Any,
     ):
         self.objects = list(objects)

@@ -70,7 +70,7 @@ def estimate_dictionaries(
     templates: dict[str, Any],
     query: dict[str, Any],
     key: Array,
-    config: Config = Config(),  # noqa: B008
+    config: Config = Config(),
 ) -> dict[str, Any]:
     """``estimate`` from and to dictionaries of arrays; ``key`` is uint32 [2]."""
     found = estimate(_to_templates(templates), _to_query(query), jax.random.wrap_key_data(key), config)
@@ -83,7 +83,7 @@ def export(
     path: str | Path,
     config: Config = Config(),
     *,
-    batch: int | None = None,  # noqa: B008
+    batch: int | None = None,
 ) -> Path:
     """Write the artifact ``path`` and its description ``path`` + ``.json``.
 

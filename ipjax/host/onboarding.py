@@ -56,7 +56,7 @@ def box_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
 def make_templates(
     mesh: Mesh,
     encoder: Encoder,
-    config: OnboardConfig = OnboardConfig(),  # noqa: B008
+    config: OnboardConfig = OnboardConfig(),
     *,
     progress: bool = True,
     backend: str = "auto",
@@ -113,7 +113,7 @@ def _describe_view(
 def onboard(
     source: str | Path | Mesh,
     encoder: Encoder | None = None,
-    config: OnboardConfig = OnboardConfig(),  # noqa: B008
+    config: OnboardConfig = OnboardConfig(),
     *,
     out: str | Path | None = None,
     name: str | None = None,

@@ -164,7 +164,8 @@ def _paint_letters(rng: np.random.Generator, image: np.ndarray, palette: np.ndar
 # A chart is a rectangle of surface laid flat: vertices, uv in its part of the texture, normals, faces.
 
 _Chart = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-_Box = tuple[float, float, float, float]  # left, bottom, right, top in uv
+_Number = float | int
+_Box = tuple[_Number, _Number, _Number, _Number]  # left, bottom, right, top in uv
 
 
 def _into(box: _Box, uv: np.ndarray) -> np.ndarray:
