@@ -185,9 +185,9 @@ _PHOTO_ONLY = ("mask", "box", "click", "depth", "camera", "image", "depth_scale"
 def _onboard(arguments: argparse.Namespace) -> int:
     output = _check_output(arguments.output, (".ipjax",))
     source = arguments.source
-    if not source.is_file():
-        raise ValueError(f"{source}: no such file")
     is_photo = source.suffix.lower() in _IMAGES
+    if not source.is_file():
+        raise ValueError(f"{source}: no such {'photo' if is_photo else 'mesh'}")
     for name in _PHOTO_ONLY if not is_photo else ("unit",):
         if getattr(arguments, name) is not None:
             other = "a mesh" if not is_photo else "a photo"
@@ -658,6 +658,9 @@ def _weights_verify(arguments: argparse.Namespace) -> None:
 # --- score, evaluate, degrade -----------------------------------------------------------------------------------------
 
 
+_METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
+
+
 def _add_score(commands: Any) -> None:
     parser = _command(
         commands,
@@ -673,9 +676,8 @@ examples:
     parser.add_argument("results", type=Path, metavar="CSV", help="scene_id,im_id,obj_id,score,R,t,time; t in mm")
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument("--split", default="test", help="which split (default test)")
-    parser.add_argument(
-        "--metrics", nargs="+", choices=("mssd", "mspd", "vsd", "add", "add_s", "ap"), default=("mssd", "mspd", "vsd")
-    )
+    parser.add_argument("--metrics", nargs="+", choices=_METRICS, default=("mssd", "mspd", "vsd"))
+    parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
     parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the score as JSON")
     parser.add_argument(
@@ -689,7 +691,8 @@ def _score(arguments: argparse.Namespace) -> int:
     from ipjax.host.bop import Dataset
     from ipjax.host.evaluation import score
 
-    dataset = Dataset(arguments.dataset, arguments.split)
+    _use_cache()
+    dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
     found = score(
         arguments.results,
         dataset,
@@ -712,94 +715,99 @@ def _add_evaluate(commands: Any) -> None:
         "estimate every target of a BOP data set with its annotated masks, and score the result",
         """\
 examples:
-  for i in ycbv/models/*.ply; do ipjax onboard $i --unit mm -o objects/$(basename $i .ply).ipjax; done
-  ipjax evaluate ycbv/ --objects objects/ -o results/
+  ipjax evaluate ycbv/ -o results/default
+  ipjax evaluate ycbv/ -o results/paper --config paper --against results/default/ipjax-default_ycbv-test.csv
+  ipjax evaluate ycbv/ -o results/level2 --mesh-quality 2        on meshes made worse; see 'ipjax degrade'
+  ipjax evaluate dexycb/ -o results/mustard --models ycbv/ --only 5 \\
+      --mesh 5=instantmesh_mustard.obj --alignment 5=instantmesh_mustard_to_obj_000005.json
 
+Objects are onboarded from the data set's models/ where that has not been done yet, and kept: in your cache, shared by
+all configurations, or in the folder that --objects names.
 Stop it at any moment and call it again: finished images are not done twice.
 """,
     )
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument(
         "--objects",
-        type=Path,
-        metavar="FOLDER",
-        required=True,
-        help="of object files named by number: obj_000001.ipjax",
+        metavar="auto|FOLDER",
+        default="auto",
+        help="object files named by number (obj_000001.ipjax); missing ones are added (default: the cache)",
     )
-    parser.add_argument("-o", "--output", type=Path, metavar="FOLDER", required=True, help="for the results")
+    parser.add_argument("-o", "--output", type=Path, metavar="RESULTS", required=True, help="folder for the results")
     parser.add_argument("--split", default="test", help="which split (default test)")
-    parser.add_argument("--method", choices=("best", "paper"), default="best", help="settings (default: best)")
+    parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only these objects")
+    parser.add_argument("--config", default="default", metavar="paper|default|FILE", help="settings; FILE is JSON")
+    parser.add_argument(
+        "--mesh-quality", type=int, default=0, choices=range(5), help="degrade the models first: 1 … 4 (default 0: not)"
+    )
+    parser.add_argument("--mesh", action="append", metavar="N=FILE", help="a mesh of your own for object N")
+    parser.add_argument(
+        "--alignment", action="append", metavar="N=JSON", help="its similarity to the model: scale, R, t; to score it"
+    )
+    parser.add_argument("--known-size", action="store_true", help="tell the method each object's true diameter")
     parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
+    parser.add_argument("--metrics", nargs="+", choices=_METRICS, default=("mssd", "mspd", "vsd", "add", "add_s"))
+    parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
+    parser.add_argument("--directions", type=_positive, metavar="N", help="viewpoints of new object files (default 40)")
+    parser.add_argument("--rolls", type=_positive, metavar="N", help="in-plane rotations of each (default 10)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--skip-bad", action="store_true", help="count damaged images as misses, instead of stopping")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    _add_encoder(parser, block=False)
+    _add_encoder(parser)
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
-    import re
-
-    if not arguments.objects.is_dir():
-        raise ValueError(f"{arguments.objects}: no such folder of object files")
-    numbered = ((re.search(r"(\d+)$", path.stem), path) for path in sorted(arguments.objects.glob("*.ipjax")))
-    files = {int(number[1]): path for number, path in numbered if number}
-    if not files:
-        raise ValueError(f"{arguments.objects}: no object files named by number, like obj_000001.ipjax")
     if arguments.output.exists() and not arguments.output.is_dir():
         raise ValueError(f"{arguments.output}: a file of this name is in the way")
-    from ipjax.config import Config
-    from ipjax.host.bop import Dataset, Estimate
-    from ipjax.host.estimation import Estimator
+    if arguments.against is not None and not arguments.against.is_file():
+        raise ValueError(f"{arguments.against}: no such result file")
+    from ipjax.config import OnboardConfig
+    from ipjax.host import studies
+    from ipjax.host.bop import Dataset
     from ipjax.host.evaluation import evaluate
-    from ipjax.host.objects import load
-    from ipjax.host.reports import compose
 
-    dataset = Dataset(arguments.dataset, arguments.split)
-    objects = {number: load(path) for number, path in files.items()}
-    encoder = _matching_encoder(arguments, [info.encoder for _, info in objects.values()])
-    for number, path in files.items():
-        _check_encoder(path, objects[number][1].encoder, encoder)
+    config = studies.read_config(arguments.config)
+    meshes = studies.parse_numbered(arguments.mesh, "--mesh")
+    alignments = studies.parse_numbered(arguments.alignment, "--alignment")
+    dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
+    views = OnboardConfig(**{k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None})
+    encoder = _load_encoder(arguments)
     arguments.notes.tell()
     _use_cache()
-    config = Config.paper() if arguments.method == "paper" else Config()
-    estimator = Estimator(list(objects.values()), encoder, config, crop=arguments.crop)
-    order = {number: i for i, number in enumerate(objects)}
-
-    def find(frame: Any, targets: list) -> list:
-        found = []
-        for target in targets:
-            i = order.get(target.obj_id)
-            if i is None or frame.depth is None:
-                continue
-            try:
-                crop = estimator.frame(i, frame.rgb, frame.depth, target.mask, frame.camera)
-            except ValueError:  # no depth on the object: a miss
-                continue
-            result = estimator.run(i, *crop, seed=arguments.seed)
-            if not bool(result.estimate.success):
-                continue
-            rotation, translation, scale = compose(result.estimate.camera_from_object, result.info.object_from_mesh)
-            unit = result.info.metres_per_unit or 1e-3  # BOP's models are in millimetres
-            score = target.score * float(result.estimate.confidence)
-            found.append(Estimate(target.obj_id, score, rotation, translation, scale / unit))
-        return found
-
-    settings = {
-        "method": arguments.method,
-        "crop": arguments.crop,
-        "seed": arguments.seed,
-        "encoder": encoder.identity,
-        "objects": {str(number): info.mesh_sha256 for number, (_, info) in objects.items()},
-    }
-    found = evaluate(
+    known = studies.prepare(
         dataset,
-        list(objects),
-        find,
-        arguments.output,
-        method=f"ipjax-{arguments.method}",
-        settings=settings,
+        encoder,
+        folder=None if arguments.objects == "auto" else arguments.objects,
+        objects=arguments.only,
+        config=views,
+        quality=arguments.mesh_quality,
+        seed=arguments.seed,
+        meshes=meshes,
+        alignments=alignments,
         progress=not arguments.quiet,
     )
+    finder = studies.Finder(
+        known, encoder, config, crop=arguments.crop, seed=arguments.seed, known_size=arguments.known_size
+    )
+    name = Path(arguments.config).stem
+    parts = ["ipjax", name, *([f"level{arguments.mesh_quality}"] if arguments.mesh_quality else [])]
+    found = evaluate(
+        dataset,
+        list(known),
+        finder,
+        arguments.output,
+        method="-".join([*parts, *(["known-size"] if arguments.known_size else [])]),
+        settings=finder.settings(),
+        alignments=studies.alignments_of(known),
+        on_error="skip" if arguments.skip_bad else "raise",
+        progress=not arguments.quiet,
+        metrics=arguments.metrics,
+        against=arguments.against,
+    )
     print(found.table())
+    for line in finder.refused:
+        print(f"not found: {line}")
     return 0
 
 

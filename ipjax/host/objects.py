@@ -4,11 +4,13 @@ Layout: one safetensors file (https://github.com/huggingface/safetensors). Its m
 key ``ipjax``: format version, who the object and the encoder are, how the normalised object frame lies in the user's
 mesh, and a checksum. Tensors, for v templates of p patches with c channels:
 
-    features f16 [v p c] · mean f32 [c] · norm f32 [v p] · points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
+    features f16 [v p c] · mean f32 [c] · norm f32 [v p]
+    points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
     rotation f32 [v 3 3] · translation f32 [v 3] · focal, centre f32 [v 2]           camera_from_object and its camera
-    surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3]
+    surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3] · axes f32 [3 3]
     mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
     pictures u8 [bytes] · pictures.end i64 [v]                                       optional, one JPEG per template
+    photo u8 [bytes]                                                                 optional, JPEG of the reference
 
 Lengths are model units: the object's bounding box is centred at the origin and its diameter is 1.
 """
@@ -54,7 +56,80 @@ _OPTIONAL_TENSORS = {
     "mesh.colours": ("uint8", "a3"),
     "pictures": ("uint8", "j"),
     "pictures.end": ("int64", "v"),
+    "photo": ("uint8", "i"),
 }
+
+
+@dataclasses.dataclass(frozen=True)
+class Reference:
+    """The photo that an object was made from, and where its camera stood.
+
+    Args:
+        file, sha256: of the photo; no folders.
+        rotation, translation, scale: ``camera_from_mesh``, x_camera = scale * rotation @ x_mesh + translation; metres
+            where `metric`, else in the arbitrary unit of the reconstruction.
+        focal, centre, size: of the photo's camera, given or assumed; pixels of the photo as it was read.
+        camera_given: the camera was told, not assumed.
+        metric: the photo had depth, so the mesh is in metres and its size was measured.
+        method: who made the mesh: "depth", "inflate" or "triposr".
+        seen: share of the surface that the photo shows; the rest is guessed.
+        picture: a small JPEG of the photo; None = not kept.
+    """
+
+    file: str
+    sha256: str
+    rotation: np.ndarray  # 3 × 3
+    translation: np.ndarray
+    scale: float
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    size: tuple[int, int]  # width, height
+    camera_given: bool
+    metric: bool
+    method: str
+    seen: float
+    picture: bytes | None = None
+
+    @property
+    def camera_from_mesh(self) -> Similarity:
+        """The photo's camera from the coordinates of the reconstructed mesh."""
+        values = (self.rotation, self.translation, self.scale)
+        return Similarity(*(jnp.asarray(x, jnp.float32) for x in values))
+
+    def as_json(self) -> dict[str, Any]:
+        """As the header holds it: without the picture."""
+        told = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "picture"}
+        return (
+            told
+            | {"rotation": np.asarray(self.rotation, float).tolist()}
+            | {"translation": np.asarray(self.translation, float).tolist()}
+        )
+
+    @staticmethod
+    def from_json(told: dict[str, Any], picture: bytes | None = None) -> "Reference":
+        """The inverse of `as_json`. Raises KeyError, TypeError or ValueError for anything else."""
+        rotation = np.asarray(told["rotation"], np.float64).reshape(3, 3)
+        translation = np.asarray(told["translation"], np.float64).reshape(3)
+        scale, numbers = float(told["scale"]), [float(x) for x in (*told["focal"], *told["centre"])]
+        if not (np.isfinite([*rotation.ravel(), *translation, scale, *numbers]).all() and scale > 0):
+            raise ValueError("the reference camera is not finite")
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+            raise ValueError("the reference camera's pose is no rotation")
+        return Reference(
+            file=str(told["file"]),
+            sha256=str(told["sha256"]),
+            rotation=rotation,
+            translation=translation,
+            scale=scale,
+            focal=(numbers[0], numbers[1]),
+            centre=(numbers[2], numbers[3]),
+            size=(int(told["size"][0]), int(told["size"][1])),
+            camera_given=bool(told["camera_given"]),
+            metric=bool(told["metric"]),
+            method=str(told["method"]),
+            seen=float(told["seen"]),
+            picture=picture,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +149,7 @@ class ObjectInfo:
         resolution: side of the template images in pixels.
         vertices, faces, colours: the normalised mesh, for pictures; None = not kept.
         pictures: the template images ``[v h w 3]`` uint8, or the JPEG bytes of each; None = not kept.
+        reference: the photo it was made from; None = made from a mesh.
     """
 
     name: str
@@ -90,6 +166,14 @@ class ObjectInfo:
     faces: np.ndarray | None = None
     colours: np.ndarray | None = None
     pictures: Any = None
+    reference: Reference | None = None
+
+    @property
+    def measured_diameter(self) -> float | None:
+        """The object's diameter in metres, where its reference photo had depth; None = free."""
+        if self.reference is None or not self.reference.metric or self.metres_per_unit is None:
+            return None
+        return self.metres_per_unit / self.mesh_scale
 
     @property
     def object_from_mesh(self) -> Similarity:
@@ -161,6 +245,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         pictures = _compress(info.pictures)
         tensors["pictures"] = np.frombuffer(b"".join(pictures), np.uint8)
         tensors["pictures.end"] = np.cumsum([len(picture) for picture in pictures])
+    if info.reference is not None and info.reference.picture:
+        tensors["photo"] = np.frombuffer(info.reference.picture, np.uint8)
     kinds = _TEMPLATE_TENSORS | _OPTIONAL_TENSORS
     tensors = {name: np.ascontiguousarray(np.asarray(array), kinds[name][0]) for name, array in tensors.items()}
     _check_shapes({name: (array.dtype.name, array.shape) for name, array in tensors.items()}, str(path))
@@ -183,6 +269,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         "notes": list(info.notes),
         "resolution": int(info.resolution),
     }
+    if info.reference is not None:
+        header["reference"] = info.reference.as_json()
     header = json.loads(json.dumps(header, allow_nan=False))
     text = json.dumps(header | {"content_sha256": _hash(header, tensors)})
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
@@ -270,20 +358,23 @@ def check(path: str | Path) -> list[str]:
     seen = tensors["valid"].sum(axis=1).mean()
     size = 1 / info.mesh_scale
     unit = f" ({size * info.metres_per_unit * 1e3:.1f} mm)" if info.metres_per_unit else ", unit unknown"
+    photo = info.reference
+    made = [] if photo is None else [f"made from the photo by {photo.method}; {photo.seen:.0%} of its surface was seen"]
     return [
         f"object {info.name!r} from {info.mesh_file or 'a mesh'} (sha256 {info.mesh_sha256[:12] or 'unknown'})",
         f"diameter {size:g} in the mesh's unit{unit}",
         f"{views} templates of {patches} patches with {channels} channels; {seen:.0f} valid each",
         f"encoder {info.encoder}",
         f"written by {header.get('writer', 'an unknown writer')}, format {header['format']}, content as written",
+        *made,
         *info.notes,
     ]
 
 
 def _version() -> str:
-    import ipjax
+    from ipjax import __version__
 
-    return ipjax.__version__
+    return __version__
 
 
 def _hash(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:
@@ -310,7 +401,7 @@ def _check_shapes(found: dict[str, tuple[str, tuple[int, ...]]], where: str) -> 
         if fits:
             for letter, length in zip(letters, shape, strict=True):
                 expected = int(letter) if letter.isdigit() else lengths.setdefault(letter, length)
-                fits = fits and length == expected and (length > 0 or letter in "abj")
+                fits = fits and length == expected and (length > 0 or letter in "abij")
         if not fits:
             raise ValueError(f"{where}: not a usable object: {name} is {dtype} {list(shape)}")
 
@@ -378,6 +469,7 @@ def _info(header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path) ->
             config=dict(header.get("config", {})),
             notes=tuple(str(note) for note in header.get("notes", ())),
             resolution=int(header["resolution"]),
+            reference=_reference(header, tensors),
         )
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ValueError(f"{path}: damaged: its description lacks the mesh, the encoder or the name") from None
@@ -400,6 +492,13 @@ def _info(header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path) ->
         colours=None if vertices is None else tensors.get("mesh.colours"),
         pictures=pictures,
     )
+
+
+def _reference(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Reference | None:
+    told = header.get("reference")
+    if told is None:
+        return None
+    return Reference.from_json(told, tensors["photo"].tobytes() if "photo" in tensors else None)
 
 
 def _compress(pictures: Any) -> list[bytes]:

@@ -4,7 +4,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,12 @@ from ipjax.types import PoseEstimate, Similarity, Templates
 CONVENTIONS = {
     "camera": "OpenCV axes of the colour camera: x right, y down, z ahead; metres; pixel centres are integers",
     "mesh": "coordinates as they stand in the mesh file, in the file's own unit",
+    "mesh_of_a_photo": "of an object made from a photo: the reconstruction, as 'onboard --save-mesh' writes it",
+    "reference_camera": "camera of the photo that the object was made from, OpenCV axes; metres where that photo had "
+    "depth (reference_unit is 'm'), else the reconstruction's own unit (reference_unit is null)",
+    "camera_from_reference_camera": "pose relative to the reference photo: maps coordinates of the reference camera to "
+    "metres of this frame's camera; rigid_motion (where reference_unit is 'm') is the same at scale 1, exact at the "
+    "object's centre",
     "object": "normalised object: bounding box centred at the origin, diameter 1 (model units)",
     "similarity": "x_camera = scale * rotation @ x + translation; rotation row by row",
     "matrix": "4 x 4, row by row, [scale * rotation, translation; 0 0 0 1]: x_camera = matrix @ (x, 1)",
@@ -22,7 +28,15 @@ CONVENTIONS = {
 }
 
 
-def compose(a_from_b: Similarity, b_from_c: Similarity) -> tuple[np.ndarray, np.ndarray, float]:
+class Plain(NamedTuple):
+    """A similarity of doubles: the records of `ipjax.types` are JAX arrays, which keep floats only."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: Any
+
+
+def compose(a_from_b: Similarity | Plain, b_from_c: Similarity | Plain) -> tuple[np.ndarray, np.ndarray, float]:
     """Rotation, translation and scale of ``a_from_c``, in double precision."""
     outer, inner = (
         tuple(np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
@@ -44,6 +58,48 @@ def tell_pose(rotation: np.ndarray, translation: np.ndarray, scale: float, unit:
         "translation_m": translation.tolist(),
         f"scale_m_per_{unit}": scale,
     }
+
+
+def invert(a_from_b: Similarity | Plain) -> Plain:
+    """``b_from_a``, in double precision."""
+    rotation, translation, scale = (
+        np.asarray(x, np.float64) for x in (a_from_b.rotation, a_from_b.translation, a_from_b.scale)
+    )
+    return Plain(rotation.T, -rotation.T @ translation / scale, 1 / scale)
+
+
+def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> tuple[np.ndarray, np.ndarray, float]:
+    """``camera_from_reference_camera`` of an estimate: rotation, translation (metres), scale (metres per unit there).
+
+    Raises ValueError for an object that was not made from a photo.
+    """
+    if info.reference is None:
+        raise ValueError("the object was not made from a photo")
+    camera_from_mesh = Plain(*compose(camera_from_object, info.object_from_mesh))
+    return compose(camera_from_mesh, invert(info.reference.camera_from_mesh))
+
+
+def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict[str, Any]:
+    """The pose relative to the reference photo as JSON can say it, with scale and, where the photo had depth, without.
+
+    Raises ValueError as `relative_pose`.
+    """
+    rotation, translation, scale = relative_pose(camera_from_object, info)
+    assert info.reference is not None
+    told = tell_pose(rotation, translation, scale, "reference_unit")
+    told["reference_unit"] = "m" if info.reference.metric else None
+    told["reference_photo"] = info.reference.file
+    told["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+    if info.reference.metric:
+        # A wrong scale about the camera would move the object: it is taken out about the object's centre.
+        centre = np.asarray(info.mesh_centre, np.float64)[None]
+        reference = info.reference
+        there = reference.scale * centre @ np.asarray(reference.rotation).T + np.asarray(reference.translation)
+        here = scale * there @ rotation.T + translation
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = rotation, (here - there @ rotation.T)[0]
+        told["rigid_motion"] = motion.tolist()
+    return told
 
 
 def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo, alternatives: int = 4) -> dict:
@@ -75,6 +131,8 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
     rotation, translation, scale = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
     told["camera_from_mesh"] = tell_pose(*compose(pose, info.object_from_mesh), "mesh_unit")
     told["camera_from_object"] = tell_pose(rotation, translation, float(scale), "model_unit")
+    if info.reference is not None:
+        told["camera_from_reference_camera"] = tell_relative_pose(pose, info)
     told["size_mm"] = {
         "diameter": 1e3 * float(scale),
         "box": [1e3 * float(scale) * float(side) for side in np.asarray(templates.extents)],
