@@ -10,13 +10,14 @@ from benchmarks.table import render
 
 
 def benchmarks():
-    """Name → function of ``quick`` that yields rows. Stages and the whole estimate belong here too."""
-    from benchmarks import geometry, neighbours
+    """Name → function of ``quick`` that yields rows."""
+    from benchmarks import geometry, neighbours, stages
 
     return {
         "neighbours": neighbours.rows,
         "umeyama": geometry.umeyama_rows,
         "consensus": geometry.consensus_rows,
+        "estimate": stages.rows,
     }
 
 
