@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Num
 
 from ipjax.types import Camera, Similarity
 
@@ -26,8 +26,8 @@ ADD_LIMIT = 0.1  # metres: where the area under the accuracy-threshold curve of 
 
 
 def discretise_symmetries(
-    discrete: Sequence[Float[np.ndarray, "4 4"]] = (),
-    continuous: Sequence[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]] = (),
+    discrete: Sequence[Num[np.ndarray, "..."]] = (),
+    continuous: Sequence[tuple[Num[np.ndarray, "..."], Num[np.ndarray, "..."]]] = (),
     step: float = SYMMETRY_STEP,
 ) -> tuple[Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3"]]:
     """All symmetry transforms of an object as rotations [s, 3, 3] and translations [s, 3], float64; the first is the

@@ -75,8 +75,9 @@ def make_templates(
     held = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
     for index in tqdm(range(len(poses.scale)), "describing", unit="view", disable=not progress):
         pose = jax.tree.map(lambda x, index=index: x[index], held)
-        camera = Camera(views.camera.focal[index], views.camera.centre[index])
-        view = View(views.rgb[index], views.depth[index], views.mask[index], camera)
+        camera = Camera(jnp.asarray(views.camera.focal[index]), jnp.asarray(views.camera.centre[index]))
+        rgb = views.rgb[index].astype(np.float32) / 255
+        view = View(jnp.asarray(rgb), jnp.asarray(views.depth[index]), jnp.asarray(views.mask[index]), camera)
         one, sure = _describe_view(encoder, view, pose, surface, config.describe)
         patches.append(one)
         seen.append(sure)
@@ -100,7 +101,6 @@ def _describe_view(
     encoder: Encoder, view: View, camera_from_object: Similarity, surface: Surface, config: DescribeConfig
 ) -> tuple[Patches, Float[Array, "p"]]:
     """The patches of one template in the object's frame, and how far the surface under each was seen."""
-    view = View(view.rgb.astype(jnp.float32) / 255, view.depth, view.mask, view.camera)
     patches = describe(encoder, view, config)
     # x_object = Rᵀ (x_camera − t): the rotation is orthonormal and a template's scale is 1.
     offset = patches.points - camera_from_object.translation
