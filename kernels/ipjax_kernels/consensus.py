@@ -74,10 +74,11 @@ def residuals(
 ) -> Float[Array, "*h k"]:
     """Squared distances |scale · rotation @ source + translation − target|², in the target's unit squared."""
     # Element by element: nine multiply-adds a pair fuse with whatever reads them; a matrix product would not.
+    scaled = scale[..., None, None] * rotation
     total = jnp.zeros((), source.dtype)
     for row in range(3):
-        moved = sum(rotation[..., row, column, None] * source[:, column] for column in range(3))
-        total = total + (scale[..., None] * moved + translation[..., row, None] - target[:, row]) ** 2
+        moved = sum(scaled[..., row, column, None] * source[:, column] for column in range(3))
+        total = total + (moved + translation[..., row, None] - target[:, row]) ** 2
     return total
 
 
@@ -93,7 +94,8 @@ def score_sets(
     total = jnp.sum(weight)
     share = weight / jnp.where(total > 0, total, 1)
     limit = jnp.square(threshold)[..., None]
-    truncated = jnp.sum(share * jnp.maximum(0, 1 - squared / jnp.where(limit > 0, limit, 1)), axis=-1)
+    inverse = 1 / jnp.where(limit > 0, limit, 1)  # one division a hypothesis, not one a pair
+    truncated = jnp.sum(share * jnp.maximum(0, 1 - squared * inverse), axis=-1)
     # Summed before the division, so that equal counts are equal numbers.
     inside = jnp.sum(jnp.where(squared < limit, weight, 0), axis=-1) / jnp.where(total > 0, total, 1)
     truncated = jnp.where(limit[..., 0] > 0, jnp.minimum(truncated, 1), 0)
