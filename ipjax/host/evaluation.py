@@ -13,7 +13,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -50,6 +50,7 @@ YCBV_SYMMETRIC = frozenset({1, 13, 14, 16, 18, 19, 20, 21})  # ADD(-S) uses ADD-
 DELTA = 0.015  # metres: VSD's visibility tolerance
 DETECTIONS = 100  # estimates per image that count for average precision (BOP 2024)
 BATCH = 64  # pairs of poses per call
+DRAWN = 48_000_000  # pixels drawn by one process for VSD; seven bytes each
 Estimator = Callable[[Frame, list[Target]], list[Estimate]]
 
 
@@ -244,22 +245,34 @@ def average_distances(
 
 
 def render_depths(
-    mesh: Mesh, poses: Sequence[Pose], cameras: np.ndarray, height: int, width: int, *, corner: float = 0.5
+    mesh: Mesh | Sequence[Mesh],
+    poses: Sequence[Pose],
+    cameras: np.ndarray,
+    height: int,
+    width: int,
+    *,
+    which: Sequence[int] | None = None,
+    corner: float = 0.5,
 ) -> Float[np.ndarray, "v h w"]:
-    """Depth images, metres along z, of a mesh alone at each pose, with K [v, 3, 3].
+    """Depth images, metres along z, of a mesh alone at each pose, with K [v, 3, 3]; of several meshes, ``which`` says
+    for each image the one that it shows.
 
     ``corner`` is where the centre of the first pixel lies in K's coordinates: ½ is what the renderers of BOP's toolkit
     do (OpenGL), and the default, because the benchmark's VSD is defined by them; 0 is what K means. VSD's distances
     use integer pixel coordinates in either case, as the toolkit's do.
     """
-    from ipjax.host.rendering import render
+    from ipjax.host.rendering import render_each
 
+    meshes = [mesh] if isinstance(mesh, Mesh) else list(mesh)
+    which = [0] * len(poses) if which is None else which
     rotation = jnp.asarray(np.stack([p.rotation for p in poses]), jnp.float32)
     translation = jnp.asarray(np.stack([p.translation for p in poses]), jnp.float32)
     focal = jnp.asarray(np.stack([cameras[:, 0, 0], cameras[:, 1, 1]], -1), jnp.float32)
     centre = jnp.asarray(cameras[:, :2, 2] - corner, jnp.float32)
     pose = Similarity(rotation, translation, jnp.ones(len(poses), jnp.float32))
-    return np.asarray(render(mesh, pose, Camera(focal, centre), height, width).depth, np.float32)
+    # Colours are of no use here, and textures take time to load.
+    plain = [replace(m, texture=None, uv=None) for m in meshes]
+    return np.asarray(render_each(plain, which, pose, Camera(focal, centre), height, width).depth, np.float32)
 
 
 @jax.jit
@@ -316,7 +329,7 @@ class Score:
     objects: dict[int, dict[str, float]]  # average recalls (and others) by object
     medians: dict[str, float]  # rotation_deg, translation_mm, scale_percent over the instances that got an estimate
     missing: int  # instances without an estimate
-    add: dict[str, float]  # add_auc, add_s_auc, add_or_s_auc, recall_01d; empty unless asked for
+    add: dict[str, float]  # add_auc, add_s_auc, add_or_s_auc, recall_01d, add_s_01d; empty unless asked for
     precision: dict[str, float]  # ap_mssd, ap_mspd, map; empty unless asked for
     seconds_per_image: float | None
     notes: tuple[str, ...] = ()
@@ -418,8 +431,6 @@ def _alignment_notes(alignments: Mapping[int, Alignment]) -> list[str]:
 
 
 def _compare(found: Score, other: Score) -> Score:
-    from dataclasses import replace
-
     shared = sorted(set(found.objects) & set(other.objects))
     key = "ar" if all("ar" in s.objects[o] for s in (found, other) for o in shared) else found.metrics[0]
     gains = [found.objects[o][key] - other.objects[o][key] for o in shared]
@@ -534,6 +545,8 @@ class _Job:
             by_object.setdefault(slot.row.obj_id, []).append(slot)
         for obj_id, mine in _bar(sorted(by_object.items()), self.progress, "objects"):
             self.measure(obj_id, mine, self.metrics)
+        if "vsd" in self.metrics:
+            self.discrepancies(slots)
         precision = self.precision(rows) if "ap" in self.metrics else {}
         return _summarise(self, slots, rows, precision, method, samples, seed)
 
@@ -581,8 +594,6 @@ class _Job:
         measured["rotation"], measured["translation"] = surface.rotation, surface.translation
         if {"add", "add_s"} & set(metrics):
             measured["add"], measured["add_s"] = average_distances(model, truths, found)
-        if "vsd" in metrics:
-            measured["vsd"] = self.discrepancies(obj_id, model.diameter, pairs, truths, found)
         place = {(id(slot), e, g): row for row, (slot, e, g) in enumerate(pairs)}
         for slot in slots:
             shape = (len(slot.estimates), len(slot.truths))
@@ -590,56 +601,59 @@ class _Job:
             for name, values in measured.items():
                 setattr(slot, name, values[rows].reshape(*shape, *values.shape[1:]))
 
-    def discrepancies(self, obj_id, diameter, pairs, truths, found) -> np.ndarray:
-        """VSD [v, t] of all pairs of one object. Poses are drawn once each, a few images at a time."""
-        values = np.ones((len(pairs), len(errors.THRESHOLDS)))
-        overlap = [
-            bool(_projections_overlap(diameter, truth, estimate)) for truth, estimate in zip(truths, found, strict=True)
-        ]
-        todo = [i for i, meets in enumerate(overlap) if meets]
-        sizes = {i: self.dataset.image_size(pairs[i][0].row.scene_id, pairs[i][0].row.im_id) for i in todo}
-        mesh = self.dataset.mesh(obj_id) if todo else None
-        for size in sorted(set(sizes.values())):
-            mine = [i for i in todo if sizes[i] == size]
-            most = max(1, 24_000_000 // (size[0] * size[1] * 2))
-            for start in range(0, len(mine), most):
-                part = mine[start : start + most]
-                # A truth that is compared with several estimates is drawn once.
-                keys: dict[tuple, int] = {}
-                poses, cameras, places = [], [], []
-                for i in part:
-                    slot, e, g = pairs[i]
-                    both = []
-                    for kind, which, pose in (("g", g, truths[i]), ("e", e, found[i])):
-                        key = (id(slot), kind, which)
-                        if key not in keys:
-                            keys[key] = len(poses)
-                            poses.append(pose)
-                            cameras.append(slot.camera)
-                        both.append(keys[key])
-                    places.append(both)
-                assert mesh is not None
-                depths = render_depths(mesh, poses, np.stack(cameras), size[1], size[0])
-                seen_of: tuple[tuple[int, int], np.ndarray] | None = None
-                for i, (at_truth, at_estimate) in zip(part, places, strict=True):
-                    slot = pairs[i][0]
-                    image = (slot.row.scene_id, slot.row.im_id)
-                    if seen_of is None or seen_of[0] != image:
-                        seen = self.depth(*image, size)
-                        if seen is None:
-                            continue
-                        seen_of = (image, seen)
-                    K = slot.camera
-                    values[i] = _vsd(
-                        seen_of[1],
-                        depths[at_truth],
-                        np.array([K[0, 0], K[1, 1]], np.float32),
-                        np.array([K[0, 2], K[1, 2]], np.float32),
-                        depths[at_estimate],
-                        np.float32(diameter),
-                        np.float32(self.delta),
-                    )
-        return values
+    def discrepancies(self, slots: list[_Slot]) -> None:
+        """Fill in VSD of all estimates. Every pose is drawn once, several objects in one child process."""
+        todo: dict[tuple[int, int], list[tuple[_Slot, int, int]]] = {}
+        for slot in slots:
+            slot.vsd = np.ones((len(slot.estimates), len(slot.truths), len(errors.THRESHOLDS)))
+            for e, g in slot.pairs():
+                truth, found = Pose(slot.truths[g].rotation, slot.truths[g].translation), _pose(slot.estimates[e])
+                if _projections_overlap(self.infos[slot.row.obj_id].diameter, truth, found):
+                    size = self.dataset.image_size(slot.row.scene_id, slot.row.im_id)
+                    todo.setdefault(size, []).append((slot, e, g))
+        for size, pairs in sorted(todo.items()):
+            pairs.sort(key=lambda pair: (pair[0].row.obj_id, pair[0].row.scene_id, pair[0].row.im_id))
+            most = max(1, DRAWN // (size[0] * size[1] * 2))
+            parts = [pairs[start : start + most] for start in range(0, len(pairs), most)]
+            for part in _bar(parts, self.progress, "batches"):
+                self._discrepancies_of(part, size)
+
+    def _discrepancies_of(self, pairs: list[tuple[_Slot, int, int]], size: tuple[int, int]) -> None:
+        # A truth that is compared with several estimates is drawn once.
+        numbers = sorted({slot.row.obj_id for slot, _, _ in pairs})
+        keys: dict[tuple, int] = {}
+        which, poses, cameras, places = [], [], [], []
+        for slot, e, g in pairs:
+            both = []
+            truth, found = Pose(slot.truths[g].rotation, slot.truths[g].translation), _pose(slot.estimates[e])
+            for key, pose in (((id(slot), "g", g), truth), ((id(slot), "e", e), found)):
+                if key not in keys:
+                    keys[key] = len(poses)
+                    which.append(numbers.index(slot.row.obj_id))
+                    poses.append(pose)
+                    cameras.append(slot.camera)
+                both.append(keys[key])
+            places.append(both)
+        meshes = [self.dataset.mesh(obj_id) for obj_id in numbers]
+        depths = render_depths(meshes, poses, np.stack(cameras), size[1], size[0], which=which)
+        seen_of: tuple[tuple[int, int], np.ndarray] | None = None
+        for (slot, e, g), (at_truth, at_estimate) in zip(pairs, places, strict=True):
+            image = (slot.row.scene_id, slot.row.im_id)
+            if seen_of is None or seen_of[0] != image:
+                seen = self.depth(*image, size)
+                if seen is None:
+                    continue
+                seen_of = (image, seen)
+            K = slot.camera
+            slot.vsd[e, g] = _vsd(
+                seen_of[1],
+                depths[at_truth],
+                np.array([K[0, 0], K[1, 1]], np.float32),
+                np.array([K[0, 2], K[1, 2]], np.float32),
+                depths[at_estimate],
+                np.float32(self.infos[slot.row.obj_id].diameter),
+                np.float32(self.delta),
+            )
 
     def depth(self, scene_id: int, im_id: int, size: tuple[int, int]) -> np.ndarray | None:
         """The sensor's depth; None, and a problem, where it is damaged."""
@@ -862,6 +876,7 @@ def _add_figures(instances: list[Instance], job: _Job) -> dict[str, float]:
         "add_s_auc": area_under_accuracy(add_s),
         "add_or_s_auc": area_under_accuracy(either),
         "recall_01d": float(np.mean(either < 0.1 * diameters)),
+        "add_s_01d": float(np.mean(add_s < 0.1 * diameters)),
     }
 
 
@@ -898,7 +913,8 @@ def _table(found: Score) -> str:
         a = found.add
         lines.append(
             f"AUC to 10 cm: ADD {100 * a['add_auc']:.1f}, ADD-S {100 * a['add_s_auc']:.1f}, ADD(-S) "
-            f"{100 * a['add_or_s_auc']:.1f}; ADD(-S) below 0.1 d: {100 * a['recall_01d']:.1f} %."
+            f"{100 * a['add_or_s_auc']:.1f}; below 0.1 d: ADD(-S) {100 * a['recall_01d']:.1f} %, ADD-S "
+            f"{100 * a['add_s_01d']:.1f} %."
         )
     if found.precision:
         p = found.precision
@@ -975,7 +991,8 @@ def evaluate(
 
     Args:
         objects: only these objects; None = all that are targets.
-        estimator: ``(frame, targets) -> estimates`` for the targets of one image; an object may be left out.
+        estimator: ``(frame, targets) -> estimates`` for the targets of one image; an object may be left out. Seconds
+            that it counts in an attribute ``compile_seconds`` are not part of the time per image.
         results_dir: gets ``results.jsonl`` (a line per finished image: the record that resuming trusts),
             ``METHOD_DATASET-SPLIT.csv``, ``score.json`` and ``score.txt``.
         settings: what the results depend on (configuration, weights, meshes), as plain JSON; a folder with results of
@@ -1027,9 +1044,10 @@ def evaluate(
                 else:
                     given = detected_targets(found, images[image])
                     before = max([d.time for d in found if d.time > 0], default=0.0)
-                start = time.perf_counter()
+                start, compiling = time.perf_counter(), getattr(estimator, "compile_seconds", 0.0)
                 estimates = list(estimator(frame, given)) if given else []
-                seconds = time.perf_counter() - start + before
+                compiling = getattr(estimator, "compile_seconds", 0.0) - compiling
+                seconds = max(time.perf_counter() - start - compiling, 0.0) + before
                 estimates = [alignments[e.obj_id].apply(e) if e.obj_id in alignments else e for e in estimates]
                 rows = [(as_row(image[0], image[1], e, seconds), float(e.scale)) for e in estimates]
                 _check_rows(rows)
