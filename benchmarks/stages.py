@@ -29,7 +29,7 @@ def rows(quick: bool):
     def front(templates, query, key, config):
         matches = match(query.patches, templates, config.match)
         pairs = select(matches, query.patches, templates, config.match)
-        return align(pairs, apparent_diameter(query, templates)[matches.view], key, config.align)
+        return align(pairs, apparent_diameter(templates, query)[matches.view], key, config.align)
 
     forms = {
         "match + select + align": (front, Config()),

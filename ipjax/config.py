@@ -47,7 +47,7 @@ class AlignConfig(eqx.Module):
 class RefineConfig(eqx.Module):
     """From a coarse similarity to one that fits the depth image."""
 
-    steps: int = _static(12)  # 0 = none, as in the paper
+    steps: int = _static(12)  # of Levenberg and Marquardt; 0 = no refinement, as in the paper
     points: int = _static(384)  # surface points per direction of the association
     reach: float = 0.06  # associations farther than this are dropped, in diameters
     width: float = 0.01  # of the robust loss, in diameters

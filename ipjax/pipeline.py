@@ -47,7 +47,7 @@ def estimate(
             matches = match(raw, _uncentred(templates), config.match)
         pairs = select(matches, query.patches, templates, config.match)
     with jax.named_scope("align"):
-        size = apparent_diameter(query, templates)[matches.view]
+        size = apparent_diameter(templates, query)[matches.view]
         poses, agreement, _, determined = align(pairs, size, key, config.align, diameter=diameter)
     parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
     if config.score.ranking == "render":
@@ -170,7 +170,7 @@ def _uncentred(templates: Templates) -> Templates:
     return eqx.tree_at(lambda t: t.patches.features, templates, raw)
 
 
-def apparent_diameter(query: Query, templates: Templates) -> Float[Array, "v"]:
+def apparent_diameter(templates: Templates, query: Query) -> Float[Array, "v"]:
     """The object's diameter in metres if the query showed it as each template does, from the area both cover.
 
     An occluded object looks smaller than it is, so this errs low.

@@ -17,7 +17,7 @@ FIXED = {"encoder", "templates", "surface", "estimator", "model"}  # made once p
 NEW = {"query", "view", "cloud", "pairs", "patches", "rgb", "depth", "mask", "image", "photo"}  # once per frame
 LAST = ("key", "config")
 # Where the arrow starts comes first: both directions are searched, and the cycle starts at the query.
-AS_KERNEL = {"match", "select", "nearest", "search", "cycle_distance", "apparent_diameter"}
+AS_KERNEL = {"match", "select", "nearest", "search", "cycle_distance"}
 KEY_FIRST = {"draw_minimal_sets", "consensus"}  # samplers, as in jax.random
 
 
