@@ -84,7 +84,9 @@ def centre_on(
     return rest / jnp.maximum(norm, 1e-9)[..., None], norm
 
 
-def lift(view: View, rows: int, columns: int, spread: float) -> tuple[Float[Array, "p 3"], Float[Array, "p"]]:
+def lift(
+    view: View, rows: int, columns: int, spread: float | Float[Array, ""]
+) -> tuple[Float[Array, "p 3"], Float[Array, "p"]]:
     """One 3-D point for each patch, and the share of its pixels that support it.
 
     The point is the mean over the patch's object pixels whose depth is within ``spread`` of their median: at a fold

@@ -16,7 +16,7 @@ from typing import Any
 
 import equinox as eqx
 
-import ipjax
+from ipjax import __version__
 from ipjax.config import Config, OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.host.bop import MM, Dataset, DatasetError, Estimate, Frame, Target, write_atomically
@@ -194,7 +194,7 @@ def _key(source: Path, encoder: Encoder, config: OnboardConfig, quality: int, se
     """All that an object file hangs on, in sixteen digits."""
     files = [source, *sorted(p for p in source.parent.glob(f"{source.stem}.*") if p != source and p.is_file())]
     parts = [
-        ipjax.__version__,
+        __version__,
         FORMAT,
         encoder.identity,
         describe_config(config),
@@ -245,7 +245,7 @@ class Finder:
             info = self.estimator.objects[self._index(obj_id)][1]
             made[str(obj_id)] = {"mesh": info.mesh_sha256, "notes": list(info.notes), **_plain(info.config)}
         return {
-            "version": ipjax.__version__,
+            "version": __version__,
             "config": describe_config(self.estimator.config),
             "crop": self.crop,
             "seed": self.seed,
