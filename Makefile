@@ -73,9 +73,15 @@ format: $(READY)
 bench: $(READY)
 	$(RUN) -m benchmarks
 
+# Objects are onboarded once, into the cache, and shared by both runs; killed and called again, it goes on.
+# WEIGHTS=file of the encoder, e.g. WEIGHTS=../shared/data/weights/dinov2_vits14_rederived_fp16.safetensors
 DATA ?= ../shared/data/ycbv
+EVALUATION ?= out/evaluation
 eval: $(READY)
-	$(BIN)/ipjax evaluate $(DATA) -o out/evaluation
+	$(BIN)/ipjax evaluate $(DATA) -o $(EVALUATION)/paper --config paper $(if $(WEIGHTS),--weights $(WEIGHTS))
+	$(BIN)/ipjax evaluate $(DATA) -o $(EVALUATION)/default $(if $(WEIGHTS),--weights $(WEIGHTS)) \
+	  --against $(EVALUATION)/paper/ipjax-paper_$(notdir $(abspath $(DATA)))-test.csv
+	$(RUN) -m benchmarks.results_page $(EVALUATION)/default $(EVALUATION)/paper --data $(DATA) --html out/accuracy.html
 
 notebooks: $(READY)
 	@for script in notebooks/*.py; do \

@@ -1080,6 +1080,14 @@ def evaluate(
     return found_score
 
 
+def _differences(old: Any, new: Any, where: str = "") -> list[str]:
+    """The names of what differs in two dictionaries of plain JSON."""
+    if not (isinstance(old, dict) and isinstance(new, dict)):
+        return [] if old == new else [where]
+    names = [name for name in {**new, **old} if where or name in new]
+    return [d for n in names for d in _differences(old.get(n), new.get(n), f"{where}.{n}" if where else n)]
+
+
 @dataclass(frozen=True)
 class Done:
     """A finished image: its rows with their scales, and what went wrong, if anything."""
@@ -1125,7 +1133,7 @@ class Journal:
             try:
                 entry = json.loads(line)
                 if number == 1:
-                    differs = [k for k in head if entry.get(k) != head[k]]
+                    differs = _differences(entry, head)
                 else:
                     scene, image = entry["image"]
                     rows = [
@@ -1138,7 +1146,7 @@ class Journal:
                     f"{self.path}, line {number}: damaged ({error}); delete the line to redo it"
                 ) from None
             if number == 1 and differs:
-                what = ", ".join(differs)
+                what = ", ".join(differs[:3]) + (" …" if len(differs) > 3 else "")
                 raise DatasetError(
                     f"{self.path}: these results were made with other settings ({what}); choose another folder"
                 )
