@@ -345,7 +345,7 @@ def _curves(found: Findings) -> str:
         points = " ".join(f"{across(k):.0f},{up(row[k]):.1f}" for k in range(STEPS // 2 + 1))
         name = _name_axis(axis, found.sides)
         parts.append(f'<polyline points="{points}" fill="none" stroke="{colours[axis]}" stroke-width="2.5"/>')
-        parts.append(f'<text x="{60 + 135 * axis}" y="192" fill="{colours[axis]}" class="key">— {name}</text>')
+        parts.append(f'<text x="{60 + 135 * axis}" y="192" style="fill:{colours[axis]}" class="key">— {name}</text>')
     return f'<svg viewBox="0 0 470 200" role="img" aria-label="likeness over turns">{"".join(parts)}</svg>'
 
 
@@ -428,9 +428,10 @@ border-radius:4px}
 figcaption{font-size:12px;color:var(--soft)}
 .sheet{display:grid;grid-template-columns:repeat(auto-fill,minmax(104px,1fr));gap:8px}
 .sheet img{width:100%;border-radius:4px}
-.key i{display:inline-block;width:12px;height:12px;border-radius:3px;margin:0 5px 0 14px;vertical-align:-1px}
+.key{margin:8px 0 0}
+.key i{display:inline-block;width:12px;height:12px;border-radius:3px;margin:0 5px 0 0;vertical-align:-1px}
 svg text{font-size:11px;fill:var(--soft)}
-svg .key{fill:inherit;font-weight:600}
+svg .key{font-weight:600}
 .globe{fill:none;stroke:var(--line);stroke-width:1.5}
 .rule{stroke:var(--line)}
 ul{margin:0;padding-left:20px}
@@ -476,7 +477,7 @@ def write_report(
     rows = [("The mesh", draw_sides(mesh, front, backend=backend), "")]
     if told:
         key = (
-            '<p class="key"><small><i style="background:#6e96c8"></i>seen in the photo'
+            '<p class="key"><small><i style="background:#6e96c8"></i>seen in the photo &emsp;'
             '<i style="background:#ff781e"></i>guessed</small></p>'
         )
         rows.append(("What was seen and what was guessed", draw_sides(tint_guessed(mesh), front, backend=backend), key))

@@ -1,0 +1,350 @@
+"""Photo → object → pose: how well an object that one photo showed is found in another frame.
+
+    python -m benchmarks.photo_pairs ycbv --data FOLDER [--limit N]
+    python -m benchmarks.photo_pairs synthetic [--data FOLDER] [--pairs 200] [--limit N]
+    python -m benchmarks.photo_pairs table RESULTS.jsonl …
+
+Each pair is a reference (one masked photo, with or without its depth) and a query (an RGB-D frame of the same object).
+The object is made from the reference without learned reconstruction weights ("rgb": the outline inflated, "rgbd": the
+depth completed) and found in the query; "scan" onboards the true mesh, the upper bound. The reference's true pose gives
+the canonical frame: estimated camera_from_reference_camera ∘ true reference_camera_from_object is compared with the
+true pose in the query. A reference without depth has no unit: there, one unit is the true depth of the object's centre
+in the reference, and the size is found by the estimate; with depth, the measured size is kept.
+
+Results are lines of JSON, one per pair and method, written as they come: run again to go on. Templates are fewer than
+by default (24 × 8 instead of 40 × 10) for speed.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+METHODS = ("rgb", "rgbd", "scan")
+BINS = (0, 15, 30, 45, 60, 90, 120, 180.1)  # degrees between the directions from which the two frames see the object
+PER_REFERENCE = 4  # queries of each synthetic reference: onboarding takes most of the time
+
+
+@dataclasses.dataclass
+class Shot:
+    """One RGB-D frame of the object, and the truth."""
+
+    name: str
+    rgb: np.ndarray
+    depth: np.ndarray  # metres
+    mask: np.ndarray
+    K: np.ndarray
+    rotation: np.ndarray  # camera_from_object
+    translation: np.ndarray  # metres
+
+
+@dataclasses.dataclass
+class Group:
+    """A reference and the queries it is tried on; the object's points and symmetries are metres of its own frame."""
+
+    object: str
+    mesh: Any  # ipjax.host.meshes.Mesh; its present frame is the object's
+    metres_per_unit: float  # of that mesh
+    model: Any  # ipjax.host.evaluation.Model
+    reference: Shot
+    queries: list[Shot]
+
+
+def view_angle(first: Shot, second: Shot) -> float:
+    """Degrees between the directions from the object's origin to the two cameras; roll is no part of it."""
+    eyes = [-shot.rotation.T @ shot.translation for shot in (first, second)]
+    cosine = eyes[0] @ eyes[1] / np.linalg.norm(eyes[0]) / np.linalg.norm(eyes[1])
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+# --- the pairs --------------------------------------------------------------------------------------------------------
+
+
+def ycbv_groups(folder: Path, objects: tuple[int, ...] = (2, 3, 4, 5, 8, 10, 15)) -> Iterator[Group]:
+    """Every frame of an object as the reference of all its frames in other scenes."""
+    from ipjax.host.bop import Dataset
+    from ipjax.host.evaluation import Model
+
+    dataset = Dataset(folder)
+    frames: dict[int, list[tuple[int, int, Any]]] = {number: [] for number in objects}
+    for scene in dataset.scenes():
+        for image in dataset.images(scene):
+            for truth in dataset.truths(scene, image):
+                if truth.obj_id in frames and truth.visible >= 0.1:
+                    frames[truth.obj_id].append((scene, image, truth))
+
+    def shoot(scene, image, truth) -> Shot:
+        frame = dataset.frame(scene, image)
+        mask = dataset.mask(scene, image, truth.index)
+        name = f"{scene:06d}/{image:06d}"
+        return Shot(name, frame.rgb, frame.depth, mask, frame.camera, truth.rotation, truth.translation)
+
+    # Interleaved over objects, so that a run cut short has seen several.
+    turns = [(k, number) for number in objects for k in range(len(frames[number]))]
+    for k, number in sorted(turns):
+        scene, image, truth = frames[number][k]
+        others = [item for item in frames[number] if item[0] != scene]
+        if others:
+            mesh = dataset.mesh(number, "models")
+            queries = [shoot(*item) for item in others]
+            model = Model.load(dataset, number)
+            yield Group(f"obj_{number:06d}", mesh, 1.0, model, shoot(scene, image, truth), queries)
+
+
+def synthetic_groups(pairs: int, data: Path | None, seed: int = 0) -> Iterator[Group]:
+    """Rendered references (the object alone, lit, on grey) of objects on cluttered tables.
+
+    The reference sees the object from an angle drawn evenly from each bin in turn, rolled by up to 20°; both frames
+    have the noise of a cheap sensor. Objects are those made in code and, where ``data`` is, the scans there.
+    """
+    import jax.numpy as jnp
+
+    from ipjax.host.bop import Dataset
+    from ipjax.host.evaluation import Model
+    from ipjax.host.meshes import normalise
+    from ipjax.host.rendering import render_scene
+    from ipjax.host.synthetic import HEIGHT, KINDS, WIDTH, Sensor, _expose, _sense, make_object, make_scene
+    from ipjax.types import Similarity
+
+    scans = []
+    if data is not None:
+        dataset = Dataset(data)
+        scans = [(f"obj_{n:06d}", normalise(dataset.mesh(n, "models"))) for n in sorted(dataset.models())]
+    none = np.eye(3)[None], np.zeros((1, 3))
+    for turn in range(-(-pairs // PER_REFERENCE)):
+        rng = np.random.default_rng([seed, turn])
+        if scans and turn % 2:
+            name, mesh = scans[turn // 2 % len(scans)]
+        else:
+            kind = KINDS[turn % len(KINDS)]
+            name, mesh = f"{kind}-{turn}", make_object(kind, 1000 + turn)
+        size = float(rng.uniform(0.09, 0.22))
+        queries = []
+        for k in range(PER_REFERENCE):
+            scene = make_scene([mesh], seed=10_000 * seed + PER_REFERENCE * turn + k, sizes=[size], clutter=3)
+            if scene.masks[0].sum() < 400:
+                continue
+            pose = scene.camera_from_object[0]
+            rotation, translation = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation))
+            queries.append(
+                Shot(f"scene {k}", scene.rgb, scene.depth, scene.masks[0], scene.matrix, rotation, translation)
+            )
+        if not queries:
+            continue
+        # One reference for several queries: its angle to the first is drawn, those to the others come of themselves.
+        low, high = BINS[turn % 5], BINS[turn % 5 + 1]
+        angle = np.deg2rad(rng.uniform(low, high))
+        first = queries[0]
+        about = rng.uniform(0, 2 * np.pi)
+        axis = np.array([np.cos(about), np.sin(about), 0.0])
+        turned = _turn(axis, angle) @ first.rotation
+        rotation = _turn(np.array([0, 0, 1.0]), np.deg2rad(rng.uniform(-20, 20))) @ turned
+        translation = np.array([*rng.uniform(-0.03, 0.03, 2), size * rng.uniform(3.0, 4.5)])
+        pose = Similarity(*(jnp.asarray(x, jnp.float32) for x in (rotation, translation, size)))
+        light = {"direction": [*rng.normal(size=2) * 0.5, 1.0], "ambient": 0.6, "diffuse": 0.45}
+        lens = scene.camera
+        drawn = render_scene([(mesh, pose)], lens, HEIGHT, WIDTH, light=light)
+        mask = drawn.mask[0]
+        rgb = np.where(mask[..., None], drawn.rgb[0], 128).astype(np.uint8)
+        depth = _sense(rng, np.where(mask, drawn.depth[0], 2.0), lens, Sensor())
+        reference = Shot("photo", _expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rotation, translation)
+        model = Model(mesh.vertices[np.unique(mesh.faces)] * size, size, *none)
+        yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries)
+
+
+def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+# --- measuring --------------------------------------------------------------------------------------------------------
+
+
+def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> None:
+    """Try every pair by every method; lines already in ``output`` are not tried again."""
+    import jax.numpy as jnp
+
+    from ipjax.host.estimation import Estimator
+    from ipjax.host.foreground import Photo
+    from ipjax.host.onboarding import onboard
+    from ipjax.host.photos import onboard_photo
+    from ipjax.host.weights import load_encoder
+    from ipjax.types import Camera
+
+    done = set()
+    if output.exists():
+        done = {tuple(json.loads(line)["key"]) for line in output.read_text().splitlines()}
+    encoder = load_encoder()
+    scans: dict[str, tuple] = {}
+    tried = 0
+    with output.open("a") as file:
+        for group in groups:
+            for method in METHODS:
+                left = len(group.queries) if limit is None else min(limit - tried, len(group.queries))
+                queries = group.queries[: max(left, 0)]
+                keys = [(method, group.object, group.reference.name, query.name) for query in queries]
+                if all(key in done for key in keys):
+                    continue
+                start, trouble = time.perf_counter(), ""
+                ref = group.reference
+                lens = Camera(
+                    focal=jnp.asarray([ref.K[0, 0], ref.K[1, 1]], jnp.float32),
+                    centre=jnp.asarray([ref.K[0, 2], ref.K[1, 2]], jnp.float32),
+                )
+                made = None
+                try:
+                    if method == "scan":
+                        if group.object not in scans:
+                            unit = group.metres_per_unit
+                            mesh = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
+                            scans = {group.object: onboard(mesh, encoder, config, metres_per_unit=unit, progress=False)}
+                        made = scans[group.object]
+                    else:
+                        depth = {"depth": ref.depth} if method == "rgbd" else {}
+                        photo = onboard_photo(
+                            Photo(ref.rgb),
+                            encoder,
+                            config,
+                            mask=ref.mask,
+                            camera=lens,
+                            lrm="inflate",
+                            progress=False,
+                            **depth,
+                        )
+                        made = photo.templates, photo.info
+                except ValueError as error:
+                    trouble = str(error)
+                onboarding = time.perf_counter() - start
+                estimator = None if made is None else Estimator([made], encoder)
+                for key, query in zip(keys, queries, strict=True):
+                    if key in done:
+                        continue
+                    start = time.perf_counter()
+                    row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble}
+                    if estimator is not None:
+                        row |= judge(group, method, estimator, query)
+                    row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
+                    file.write(json.dumps(row) + "\n")
+                    file.flush()
+                    told = f"ADD-S {row['add_s']:.3f}, {row['rotation']:.0f}°" if "add_s" in row else row["trouble"]
+                    print(f"{' '.join(key)} at {row['angle']:.0f}°: {told}", flush=True)
+            tried += len(group.queries)
+            if limit is not None and tried >= limit:
+                return
+
+
+def judge(group: Group, method: str, estimator, query: Shot) -> dict:
+    """The pose found in the query against the truth of both frames; distances in diameters."""
+    from scipy.spatial import KDTree
+
+    from ipjax.host.evaluation import Pose, surface_errors
+    from ipjax.host.reports import Plain, compose, relative_pose
+
+    info = estimator.objects[0][1]
+    try:
+        crop = estimator.frame(0, query.rgb, query.depth, query.mask, query.K)
+    except ValueError as error:
+        return {"trouble": str(error)}
+    result = estimator.run(0, *crop, diameter=info.measured_diameter)
+    if not bool(result.estimate.success):
+        return {"trouble": "no pose found"}
+    found = result.estimate.camera_from_object
+    if method == "scan":
+        rotation, translation, scale = compose(found, info.object_from_mesh)
+        scale = scale / group.metres_per_unit  # metres per metre of the model
+    else:
+        ref = group.reference
+        unit = 1.0 if info.measured_diameter is not None else 1 / float(ref.translation[2])
+        there = Plain(ref.rotation, unit * ref.translation, unit)
+        rotation, translation, scale = compose(Plain(*relative_pose(found, info)), there)
+    model = group.model
+    points = model.points
+    truth = points @ query.rotation.T + query.translation
+    mine = scale * points @ rotation.T + translation
+    nearest = KDTree(mine).query(truth)[0].mean() / model.diameter
+    errors = surface_errors(
+        model, query.K[None], [Pose(query.rotation, query.translation)], [Pose(rotation, translation)]
+    )
+    middle = (points.min(0) + points.max(0)) / 2
+    moved = scale * rotation @ middle + translation - (query.rotation @ middle + query.translation)
+    steps = np.arange(0.05, 0.51, 0.05)
+    mssd, mspd = float(errors.mssd[0]) / model.diameter, float(errors.mspd[0]) * 640 / query.rgb.shape[1]
+    return {
+        "add_s": float(nearest),
+        "rotation": float(np.degrees(errors.rotation[0])),
+        "translation_mm": float(1e3 * np.linalg.norm(moved)),
+        "scale": float(scale),
+        "mssd_recall": float(np.mean(mssd < steps)),
+        "mspd_recall": float(np.mean(mspd < 100 * steps)),
+        "confidence": float(result.estimate.confidence),
+    }
+
+
+def table(rows: list[dict]) -> str:
+    """Markdown: by method and angle; what was not found counts as a miss, medians are of what was found."""
+    lines = [
+        "| object from | angle | pairs | ADD-S < 10 % | rotation < 15° | median rotation | median shift | median size "
+        "| MSSD recall | MSPD recall |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    spans = [*itertools.pairwise(BINS), (0, 45), (0, 180.1)]
+    for method in METHODS:
+        for low, high in spans:
+            chosen = [row for row in rows if row["key"][0] == method and low <= row["angle"] < high]
+            if not chosen:
+                continue
+            good = [row for row in chosen if "add_s" in row]
+            mean = lambda test, good=good, chosen=chosen: sum(test(row) for row in good) / len(chosen)
+            middle = lambda name, good=good: float(np.median([row[name] for row in good])) if good else np.nan
+            lines.append(
+                f"| {method} | {low:.0f}–{high:.0f}° | {len(chosen)} | {mean(lambda r: r['add_s'] < 0.1):.0%} "
+                f"| {mean(lambda r: r['rotation'] < 15):.0%} | {middle('rotation'):.0f}° "
+                f"| {middle('translation_mm'):.0f} mm | {middle('scale'):.2f} "
+                f"| {mean(lambda r: r['mssd_recall']):.2f} | {mean(lambda r: r['mspd_recall']):.2f} |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """See the module's text."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("ycbv", "synthetic", "table"))
+    parser.add_argument("results", type=Path, nargs="*")
+    parser.add_argument("--data", type=Path, help="a BOP data set: frames for ycbv, scans for synthetic")
+    parser.add_argument("--output", type=Path, help="lines of JSON (default build/photo_pairs_WHAT.jsonl)")
+    parser.add_argument("--pairs", type=int, default=200)
+    parser.add_argument("--limit", type=int, help="stop after so many pairs")
+    parser.add_argument("--directions", type=int, default=24)
+    parser.add_argument("--rolls", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    if options.what == "table":
+        print(table([json.loads(line) for path in options.results for line in path.read_text().splitlines()]))
+        return
+    from ipjax.config import OnboardConfig
+
+    output = options.output or Path("build") / f"photo_pairs_{options.what}.jsonl"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    if options.what == "ycbv":
+        if options.data is None:
+            sys.exit("ycbv needs --data FOLDER")
+        groups = ycbv_groups(options.data)
+    else:
+        groups = synthetic_groups(options.pairs, options.data, options.seed)
+    start = time.perf_counter()
+    run(groups, output, OnboardConfig(directions=options.directions, rolls=options.rolls), options.limit)
+    rows = [json.loads(line) for line in output.read_text().splitlines()]
+    print(f"\n{options.directions} × {options.rolls} templates; this run took {time.perf_counter() - start:.0f} s\n")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
