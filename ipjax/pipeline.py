@@ -37,7 +37,11 @@ def estimate(
 
     Returns:
       ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera.
+
+    Raises:
+      ValueError: the crop is not square, or its features are not those of the templates' encoder.
     """
+    _check_shapes(templates, query)
     with jax.named_scope("match"):
         raw = query.patches
         query = eqx.tree_at(lambda q: q.patches.features, query, centre_on(raw.features, templates.mean)[0])
@@ -73,6 +77,18 @@ def estimate(
         rmse=jnp.sqrt(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
         success=determined[0],
     )
+
+
+def _check_shapes(templates: Templates, query: Query) -> None:
+    height, width = query.view.depth.shape
+    if height != width:
+        raise ValueError(f"estimate takes square crops, as ipjax.frame makes them, not {height} × {width} pixels")
+    given, wanted = query.patches.features.shape[-1], templates.mean.shape[-1]
+    if given != wanted:
+        raise ValueError(
+            f"the query's features have {given} channels and the templates' {wanted}: "
+            "they must come from the same encoder"
+        )
 
 
 class _Scene(eqx.Module):

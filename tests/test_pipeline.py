@@ -134,3 +134,25 @@ def test_paper_runs_without_refinement(templates):
     found = estimate(templates, query, jax.random.key(0), Config.paper())
     assert bool(found.success)
     assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.3 * float(truth.scale)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda q: eqx.tree_at(lambda q: q.patches.features, q, q.patches.features[:, :16]),
+            "16 channels.*same encoder",
+        ),
+        (lambda q: eqx.tree_at(lambda q: q.view.depth, q, q.view.depth[:56]), "square crops.*56 × 112"),
+    ],
+)
+def test_what_does_not_fit_is_said(templates, change, message):
+    from jaxtyping import config
+
+    query, _ = problems.make_query(0)
+    config.update("jaxtyping_disable", True)  # it would speak first
+    try:
+        with pytest.raises(ValueError, match=message):
+            ipjax.estimate(templates, change(query), jax.random.key(0), TINY)
+    finally:
+        config.update("jaxtyping_disable", False)
