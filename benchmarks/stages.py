@@ -46,7 +46,9 @@ def rows(quick: bool):
         queries = jax.tree.map(lambda x, batch=batch: jnp.broadcast_to(x, (batch, *x.shape)), query)
         many = (templates, queries, jax.random.split(key, batch))
         made = compile_fresh(jax.vmap(estimate, (None, 0, 0, None)), *many, Config())
-        seconds = time_in_turns({"batch": lambda made=made, many=many: made[0](*many, Config())}, 5, seconds=40)["batch"]
+        seconds = time_in_turns({"batch": lambda made=made, many=many: made[0](*many, Config())}, 5, seconds=40)[
+            "batch"
+        ]
         found = row(f"estimate, {batch} queries at once", size, made, seconds)
         print(f"  {batch / (found['median_ms'] / 1e3):.2f} queries/s")
         yield found
