@@ -2,8 +2,10 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import numpy as np
 import pytest
 from bop_roots import ERRORS, PROTOCOL, write_images, write_protocol
 
-from ipjax.host import bop, evaluation
+from ipjax.host import bop, evaluation, studies
 from ipjax.host.bop import DatasetError, Estimate, ResultRow
 
 VSD = np.load(Path(__file__).resolve().parent / "golden" / "bop_vsd.npz")
@@ -298,3 +300,85 @@ def test_the_truth_of_the_mini_set_scores_one(shared):
     found = evaluation.score(rows, dataset, ("mssd", "mspd", "add_s"), objects=[14, 18], samples=50)
     assert found.all_frames.recalls == {"mssd": 1.0, "mspd": 1.0}
     assert found.add["add_or_s_auc"] == 1.0
+
+
+# Studies: settings, and what they are made of
+
+
+def test_settings_from_a_file(tmp_path):
+    from ipjax.config import Config
+
+    path = tmp_path / "settings.json"
+    path.write_text('{"from": "paper", "match": {"views": 4, "cycle": 3}, "align": {"scale_gate": [0.1, 10]}}')
+    config = studies.read_config(path)
+    assert (config.match.views, config.match.cycle, config.align.scale_gate) == (4, 3.0, (0.1, 10.0))
+    assert config.score == Config.paper().score
+    assert studies.read_config("paper") == Config.paper() != studies.read_config("default") == Config()
+    for text, says in (
+        ('{"match": {"view": 4}}', "match: no setting 'view'"),
+        ('{"match": 4}', "match holds settings of its own"),
+        ('{"match": {"views": "many"}}', "views is 8 by default"),
+        ('{"align": {"count": true}}', "of another kind"),
+        ('{"from": "nowhere"}', "'from' is default or paper"),
+        ("[1]", "a JSON object"),
+        ("{", "no JSON"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=re.escape(says)):
+            studies.read_config(path)
+    with pytest.raises(ValueError, match="neither paper, default nor a file"):
+        studies.read_config("fast")
+
+
+def test_settings_are_plain_json_even_where_they_are_infinite():
+    from ipjax.config import Config
+
+    told = studies.describe_config(Config.paper())
+    assert json.loads(json.dumps(told, allow_nan=False)) == told
+    assert told["match"]["cycle"] == "inf"
+
+
+def test_the_refusal_names_the_setting(small, tmp_path):
+    run(small, tmp_path, Noisy(small), settings={"config": {"match": {"views": 4, "pairs": 50}}})
+    with pytest.raises(DatasetError, match=re.escape("(settings.config.match.views)")):
+        run(small, tmp_path, Noisy(small), settings={"config": {"match": {"views": 8, "pairs": 50}}})
+
+
+def test_numbered_files(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("")
+    assert studies.parse_numbered([f"5={path}"], "--mesh") == {5: path}
+    for bad in ("5", f"x={path}", f"5={path}x"):
+        with pytest.raises(ValueError, match="--mesh"):
+            studies.parse_numbered([bad], "--mesh")
+
+
+def test_compilation_is_not_time_per_image(small, tmp_path):
+    class Slow(Noisy):
+        compile_seconds = 0.0
+
+        def __call__(self, frame, targets):
+            if not self.calls:
+                time.sleep(0.5)
+                self.compile_seconds += 0.5
+            return super().__call__(frame, targets)
+
+    found = run(small, tmp_path, Slow(small))
+    assert found.seconds_per_image is not None and 0 <= found.seconds_per_image < 0.1
+
+
+def test_several_objects_are_drawn_at_once(small):
+    """Each image shows its own object alone, as if it had been drawn by itself."""
+    truths = {t.obj_id: t for t in small.truths(0, 0)}
+    numbers = sorted(truths)
+    poses = [evaluation.Pose(truths[n].rotation, truths[n].translation) for n in numbers]
+    camera = small.camera(0, 0)[0][None]
+    meshes = [small.mesh(n) for n in numbers]
+    together = evaluation.render_depths(
+        meshes, poses[::-1], np.repeat(camera, len(poses), 0), 96, 128, which=list(range(len(poses)))[::-1]
+    )
+    for place, n in enumerate(reversed(numbers)):
+        alone = evaluation.render_depths(small.mesh(n), [poses[numbers.index(n)]], camera, 96, 128)[0]
+        assert (alone > 0).any()
+        np.testing.assert_array_equal(together[place] > 0, alone > 0)
+        np.testing.assert_allclose(together[place], alone, atol=1e-6)
