@@ -13,7 +13,7 @@ from ipjax.features import centre_on, lift
 from ipjax.matching import match, select
 from ipjax.refinement import Cloud, refine
 from ipjax.scoring import score
-from ipjax.types import Camera, Hypotheses, PoseEstimate, Query, Similarity, Templates
+from ipjax.types import Camera, Hypotheses, Patches, PoseEstimate, Query, Similarity, Templates
 
 
 def estimate(
@@ -43,13 +43,10 @@ def estimate(
     """
     _check_shapes(templates, query)
     with jax.named_scope("match"):
-        raw = query.patches
-        query = eqx.tree_at(lambda q: q.patches.features, query, centre_on(raw.features, templates.mean)[0])
-        if config.match.centred:
-            matches = match(query.patches, templates, config.match)
-        else:
-            matches = match(raw, _uncentred(templates), config.match)
+        matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
+    # From here on the query's features are centred, as the templates' are.
+    query = eqx.tree_at(lambda q: q.patches.features, query, centre_on(query.patches.features, templates.mean)[0])
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
         poses, agreement, _, determined = align(pairs, size, key, config.align, diameter=diameter)
@@ -181,9 +178,18 @@ def turn(poses: Similarity, axes: Float[Array, "3 3"]) -> Similarity:
     return Similarity(rotation, repeat(poses.translation), repeat(poses.scale))
 
 
-def _uncentred(templates: Templates) -> Templates:
+def comparable(templates: Templates, query: Patches, config: Config = Config()) -> tuple[Patches, Templates]:
+    """The query's patches and the templates with features of one kind: without the object's mean, or raw.
+
+    Args:
+      templates: as onboarded, centred.
+      query: as described, raw.
+    """
+    if config.match.centred:
+        features = centre_on(query.features, templates.mean)[0]
+        return eqx.tree_at(lambda q: q.features, query, features), templates
     raw = templates.patches.features.astype(templates.mean.dtype) * templates.norm[..., None] + templates.mean
-    return eqx.tree_at(lambda t: t.patches.features, templates, raw)
+    return query, eqx.tree_at(lambda t: t.patches.features, templates, raw)
 
 
 def apparent_diameter(templates: Templates, query: Query) -> Float[Array, "v"]:

@@ -13,6 +13,7 @@ from ipjax.config import Config
 from ipjax.host.images import as_intrinsics
 from ipjax.host.objects import ObjectInfo
 from ipjax.matching import match
+from ipjax.pipeline import comparable
 from ipjax.types import PoseEstimate, Query, Similarity, Templates
 
 _PALETTE = ((64, 224, 208), (255, 183, 77), (186, 104, 200), (129, 199, 132), (100, 181, 246), (240, 98, 146))
@@ -52,11 +53,11 @@ def gather_evidence(
         templates,
         **{
             name: jax.tree.map(lambda x: x[view : view + 1], getattr(templates, name))
-            for name in ("patches", "seen", "camera_from_object", "camera")
+            for name in ("patches", "norm", "seen", "camera_from_object", "camera")
         },
     )
     settings = dataclasses.replace(config.match, views=1)
-    matches = jax.tree.map(np.asarray, jax.jit(match)(query.patches, one, settings))
+    matches = jax.tree.map(np.asarray, jax.jit(match)(*comparable(one, query.patches, config), settings))
     kept = np.isfinite(matches.distance[0]) & (matches.distance[0] <= config.match.cycle)
     q, t = matches.query[0][kept], matches.template[0][kept]
     height, width = query.view.mask.shape
