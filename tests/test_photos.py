@@ -69,7 +69,8 @@ def test_a_photo_with_depth_makes_an_object_in_metres(metric, tmp_path):
     assert 0.2 < reference.seen < 0.6
     # The centre of the object, told through the file's own numbers, stands where the ball stands.
     camera_from_object = compose(reference.camera_from_mesh, invert(info.object_from_mesh))
-    np.testing.assert_allclose(camera_from_object[1], [0, 0, 0.6], atol=0.012)
+    np.testing.assert_allclose(camera_from_object[1][:2], 0, atol=0.005)
+    assert 0.54 < camera_from_object[1][2] < 0.62  # behind its front; how far the back reaches is guessed
     path = tmp_path / "ball.ipjax"
     save(path, metric.templates, info)
     again = load(path)[1].reference

@@ -168,7 +168,7 @@ def measure_texture(info: ObjectInfo) -> float:
         return 0.0
     spreads = []
     for view in np.linspace(0, len(info.pictures) - 1, 24).astype(int):
-        picture = info.picture(view)
+        picture = info.picture(int(view))
         if picture is None:
             continue
         inside = cv2.erode((picture.max(-1) > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
