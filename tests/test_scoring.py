@@ -1,0 +1,95 @@
+"""Scores prefer the truth, ignore occluders, and stay in [0, 1]."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ipjax.config import ScoreConfig
+from ipjax.refinement import retract
+from ipjax.scoring import closeness, depth_agreement, feature_agreement, look_along
+from ipjax.types import Camera
+
+CONFIG = ScoreConfig()
+depth_score = jax.jit(depth_agreement)
+feature_score = jax.jit(feature_agreement)
+
+
+@pytest.fixture(scope="module")
+def templates():
+    return eqx.tree_at(lambda t: t.surface, problems.make_templates(), problems.make_surface(2048))
+
+
+@pytest.fixture(scope="module")
+def case():
+    query, truth = problems.make_query(6)
+    camera = query.view.camera
+    camera = Camera(camera.focal / 2, (camera.centre + 0.5) / 2 - 0.5)
+    return query, query.view.depth[1::2, 1::2], query.view.mask[1::2, 1::2], camera, truth
+
+
+def disturb(pose, seed, rotation=0.5, shift=0.15):
+    rng = np.random.default_rng(seed)
+    turn, move = rng.normal(size=(2, 3))
+    step = [*(rotation * turn / np.linalg.norm(turn)), *(shift * move / np.linalg.norm(move)), 0.0]
+    return retract(pose, jnp.asarray(step, jnp.float32))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_truth_agrees_with_the_depth_and_others_less(templates, case, seed):
+    """The rim of a smooth body is steeper than a cell, so even the truth does not agree everywhere."""
+    _, depth, mask, camera, truth = case
+    best = float(depth_score(templates.surface, depth, mask, camera, truth, CONFIG))
+    other = float(depth_score(templates.surface, depth, mask, camera, disturb(truth, seed), CONFIG))
+    assert 0 <= other < best <= 1
+    assert best > 0.7
+
+
+def test_an_occluder_counts_neither_way(templates, case):
+    """Half of the object behind something near: the truth scores nearly as well as before."""
+    _, depth, mask, camera, truth = case
+    whole = float(depth_score(templates.surface, depth, mask, camera, truth, CONFIG))
+    hidden = jnp.asarray(np.arange(56) < 28)[None, :]
+    nearer = jnp.where(hidden, 0.5 * float(truth.translation[2]), depth)
+    score = float(depth_score(templates.surface, nearer, mask & ~hidden, camera, truth, CONFIG))
+    assert score > 0.85 * whole
+    # The same half farther away than the object can be: it is not there.
+    farther = jnp.where(hidden, 2 * float(truth.translation[2]), depth)
+    assert float(depth_score(templates.surface, farther, mask & ~hidden, camera, truth, CONFIG)) < 0.6 * score
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_features_prefer_the_truth(templates, case, seed):
+    query, *_, truth = case
+    best = float(feature_score(templates, query, truth, CONFIG))
+    far = disturb(truth, seed, rotation=0.9, shift=0.3)
+    assert 0 <= float(feature_score(templates, query, far, CONFIG)) < best <= 1
+
+
+def test_a_template_is_closest_to_its_own_viewpoint(templates):
+    for view in range(8):
+        pose = jax.tree.map(lambda x, view=view: x[view], templates.camera_from_object)
+        angles = np.asarray(closeness(templates, pose))
+        assert angles.argmin() == view and angles[view] < 1e-3
+
+
+@given(seed=st.integers(0, 2**31))
+def test_looking_along_a_ray_puts_it_on_the_axis(seed):
+    ray = np.random.default_rng(seed).normal(size=3)
+    ray[2] = abs(ray[2]) + 0.1
+    ray /= np.linalg.norm(ray)
+    turn = np.asarray(look_along(jnp.asarray(ray, jnp.float32)), np.float64)
+    np.testing.assert_allclose(turn @ ray, [0, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-5)
+
+
+def test_nothing_seen_scores_nothing(templates, case):
+    query, depth, mask, camera, truth = case
+    nothing = jnp.zeros_like(mask)
+    assert float(depth_score(templates.surface, jnp.zeros_like(depth), nothing, camera, truth, CONFIG)) == 0
+    blind = eqx.tree_at(lambda q: q.view.mask, query, jnp.zeros_like(query.view.mask))
+    assert float(feature_score(templates, blind, truth, CONFIG)) == 0
