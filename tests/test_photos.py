@@ -140,7 +140,8 @@ def test_a_lens_is_undone():
     lens = Intrinsics(K, (-0.3, 0.1, 0.0, 0.0, 0.0), "plumb_bob")
     shot = photos.take_shot(Photo(rgb), mask=mask, depth=depth, camera=lens)
     assert any("lens" in note for note in shot.foreground.notes)
-    assert shot.foreground.mask.sum() != mask.sum() and shot.depth.shape == mask.shape
+    assert not np.array_equal(shot.foreground.rgb, rgb)
+    assert shot.foreground.rgb.shape == rgb.shape and shot.depth.shape == mask.shape
 
 
 BAD = {
