@@ -13,7 +13,7 @@ from ipjax.matching import match, select
 from ipjax.pipeline import apparent_diameter, estimate
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
-import problems  # noqa: E402
+import problems
 
 BATCHES = (4, 16)
 

@@ -834,13 +834,12 @@ def _degrade(arguments: argparse.Namespace) -> int:
     if arguments.alignment is not None:
         _check_output(arguments.alignment, (".json",))
     from ipjax.host.degradation import degrade
-    from ipjax.host.demo import write_mesh
-    from ipjax.host.meshes import load_mesh
+    from ipjax.host.meshes import load_mesh, save_mesh
     from ipjax.host.reports import to_json, write_text
 
     mesh = load_mesh(arguments.mesh)
     worse, alignment = degrade(mesh, arguments.level, arguments.seed)
-    write_mesh(output, worse)
+    save_mesh(worse, output)
     if arguments.alignment is not None:
         write_text(arguments.alignment, to_json(alignment.as_json()))
     print(f"{output}: level {arguments.level}")

@@ -10,7 +10,7 @@ import pytest
 
 import ipjax
 from ipjax.host import onboarding
-from ipjax.host.demo import write_mesh
+from ipjax.host.meshes import save_mesh
 from ipjax.host.synthetic import PERFECT, make_object, make_scene
 from ipjax.host.weights import WeightsError, resolve
 
@@ -43,7 +43,7 @@ def test_quickstart_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     mug = make_object("mug")
     scene = make_scene([mug], clutter=0, sensor=PERFECT, oversample=1, least_visible=0.9)
-    write_mesh(tmp_path / "mug.glb", mug)
+    save_mesh(mug, tmp_path / "mug.glb")
     names = {"rgb": scene.rgb, "depth": scene.depth, "mask": scene.masks[0], "camera": scene.matrix}
     exec(compile(code, str(README), "exec"), names)
 

@@ -18,7 +18,7 @@ from ipjax.dinov2 import Encoder
 from ipjax.host.degradation import Alignment, degrade
 from ipjax.host.drawing import draw, gather_evidence, write_image
 from ipjax.host.estimation import Estimator
-from ipjax.host.meshes import Mesh, sample_surface
+from ipjax.host.meshes import Mesh, sample_surface, save_mesh
 from ipjax.host.objects import SUFFIX, ObjectInfo
 from ipjax.host.onboarding import onboard
 from ipjax.host.synthetic import Scene, make_object, make_scene
@@ -72,7 +72,8 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
     say(f"a table with {len(scene.masks)} objects and clutter, drawn by {scene.backend}; the {kind} is lost")
 
     copy, original_from_copy = degrade(original, LEVEL, seed)
-    mesh_file = write_mesh(folder / f"{kind}.glb", copy)
+    mesh_file = folder / f"{kind}.glb"
+    save_mesh(copy, mesh_file)
     say(f"a copy of the {kind} as a reconstruction model might make it: bumpy, blurred, of another size, turned")
 
     templates, info = onboard(mesh_file, encoder, out=folder / f"{kind}{SUFFIX}")
@@ -109,23 +110,6 @@ def write_inputs(folder: Path, scene: Scene, index: int) -> str:
     (folder / "camera.json").write_text(json.dumps(camera) + "\n")
     names = {name: folder / f"{name}.png" for name in ("rgb", "depth", "mask")} | {"camera": folder / "camera.json"}
     return " ".join(f"--{name} {path}" for name, path in names.items())
-
-
-def write_mesh(path: Path, mesh: Mesh) -> Path:
-    """Write a mesh with its texture or its vertex colours; the suffix decides the format."""
-    import trimesh
-    from PIL import Image
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=mesh.normals, process=False)
-    if mesh.texture is not None and mesh.uv is not None:
-        material = PBRMaterial(baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=1.0)
-        shape.visual = TextureVisuals(uv=mesh.uv, material=material)
-    else:
-        shape.visual.vertex_colors = mesh.colours  # type: ignore[union-attr]
-    shape.export(path)
-    return path
 
 
 def _to_original(camera_from_object: Similarity, info: ObjectInfo, original_from_copy: Alignment) -> Similarity:

@@ -497,7 +497,12 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         path.write_text(text)
         return
     data = out.export(file_type=kind[1:])
-    path.write_bytes(data if isinstance(data, bytes) else str(data).encode())
+    temporary = path.with_name(f".{path.name}.part")  # the file appears whole or not at all
+    try:
+        temporary.write_bytes(data if isinstance(data, bytes) else str(data).encode())
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 # --- repairing -----------------------------------------------------------------------------------------------------
