@@ -156,3 +156,28 @@ def test_what_does_not_fit_is_said(templates, change, message):
             ipjax.estimate(templates, change(query), jax.random.key(0), TINY)
     finally:
         config.update("jaxtyping_disable", False)
+
+
+def test_objects_padded_to_one_size_equal_the_loop(templates):
+    """Six views and two that hold nothing are six views; together with another object as alone."""
+    six = eqx.tree_at(
+        lambda t: (t.patches, t.norm, t.seen, t.camera_from_object, t.camera),
+        templates,
+        jax.tree.map(
+            lambda x: x[:6],
+            (templates.patches, templates.norm, templates.seen, templates.camera_from_object, templates.camera),
+        ),
+    )
+    keep = jnp.arange(8)[:, None] < 6
+    padded = eqx.tree_at(lambda t: t.patches.valid, templates, templates.patches.valid & keep)
+    both = jax.tree.map(lambda *x: jnp.stack(x), templates, padded)
+    query, _ = problems.make_query(11)
+    queries = jax.tree.map(lambda x: jnp.stack([x, x]), query)
+    keys = jax.random.split(jax.random.key(3), 2)
+    config = Config.paper()
+    together = jax.jit(jax.vmap(ipjax.estimate, (0, 0, 0, None)))(both, queries, keys, config)
+    for index, one in enumerate((templates, six)):
+        alone = jax.jit(ipjax.estimate)(one, query, keys[index], config)
+        found = jax.tree.map(lambda x, index=index: x[index], together)
+        assert int(found.view) == int(alone.view) and int(found.inliers) == int(alone.inliers)
+        same(found.camera_from_object, alone.camera_from_object, 1e-3)
