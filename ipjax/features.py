@@ -59,8 +59,7 @@ def centre(
 ) -> tuple[Patches, Float[Array, "c"], Float[Array, "v p"]]:
     """Take the mean of an object's features out of every one of them, and make what is left unit vectors again.
 
-    All patches of one object share most of their feature; what tells them apart is the rest. Centring raises the share
-    of queries whose first template is within 30° (``benchmarks/results``).
+    All patches of one object share most of their feature; what tells them apart is the rest.
 
     Args:
       patches: of all templates, ``v p``; the mean is over the valid ones.
