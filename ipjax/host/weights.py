@@ -274,6 +274,7 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
             if total is None or part.stat().st_size == total:
                 break
         except urllib.error.HTTPError as error:
+            error.close()  # it holds the connection
             if error.code == 416 and start:  # nothing left to send
                 break
             raise OSError(f"{source.url} answers {error.code} {error.reason}") from None
