@@ -51,6 +51,7 @@ class RefineConfig(eqx.Module):
     points: int = _static(384)  # surface points per direction of the association
     reach: float = 0.06  # associations farther than this are dropped, in diameters
     width: float = 0.01  # of the robust loss, in diameters
+    outline_width: float = 0.03  # of the loss on what projects beside the mask, in diameters
 
 
 class ScoreConfig(eqx.Module):
@@ -62,6 +63,8 @@ class ScoreConfig(eqx.Module):
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
     power: float = 2.0  # of the feature agreement beside the depth agreement
     tolerance: float = 0.05  # depth difference that still agrees, in diameters
+    drawn: int = _static(8)  # best candidates drawn and compared again, where the encoder is given; 0 = none
+    apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters are drawn once
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
 
@@ -102,4 +105,5 @@ class OnboardConfig(eqx.Module):
     fill: float = _static(0.83)  # share of the image that the object's box takes: 20 % of padding around it
     distance: float = _static(3.0)  # diameters from the camera to the object's centre
     surface: int = _static(2048)  # points sampled on the surface
+    appearance: int = _static(65536)  # coloured points to draw candidates from; 0 = none
     describe: DescribeConfig = DescribeConfig()

@@ -1,5 +1,7 @@
 """Figure 2 of the paper, from the query on: one pure function, one graph."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,8 +13,8 @@ from ipjax.alignment import align
 from ipjax.config import Config
 from ipjax.features import centre_on, lift
 from ipjax.matching import match, select
-from ipjax.refinement import Cloud, refine
-from ipjax.scoring import score
+from ipjax.refinement import Cloud, nearest_inside, refine
+from ipjax.scoring import depth_agreement, drawn_agreement, feature_agreement, score
 from ipjax.types import Camera, Hypotheses, Patches, PoseEstimate, Query, Similarity, Templates
 
 
@@ -23,6 +25,7 @@ def estimate(
     config: Config = Config(),
     *,
     diameter: Float[Array, ""] | None = None,
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None = None,
 ) -> PoseEstimate:
     """The object's pose and size in the query's camera.
 
@@ -34,6 +37,8 @@ def estimate(
       key: of the minimal sets; same key, same answer.
       config: thresholds are traced, sizes and switches static.
       diameter: the object's true diameter in metres, where it is known.
+      encoder: the one that described the query; with it the best candidates are drawn and described again, and only
+        they are among the hypotheses. Slower by one encoding for each, and surer.
 
     Returns:
       ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera.
@@ -56,6 +61,10 @@ def estimate(
         poses, parent, determined, agreement = _rounds(
             templates, query, scene, (poses, parent, determined), config, scale_known=diameter is not None
         )
+        if encoder is not None and templates.appearance is not None and config.score.drawn:
+            poses, parent, determined, agreement = _draw_best(
+                encoder, templates, query, scene, (poses, parent, determined, agreement), config
+            )
     agreement = jnp.where(determined, agreement, -1)
     agreement, order = lax.top_k(agreement, agreement.shape[0])
     poses, parent, determined = jax.tree.map(lambda x: x[order], (poses, parent, determined))
@@ -100,10 +109,17 @@ class _Scene(eqx.Module):
         cell = side / grid
         points, cover = lift(query.view, grid, grid, 0.05)
         camera = Camera(query.view.camera.focal / cell, (query.view.camera.centre + 0.5) / cell - 0.5)
-        self.cloud = Cloud(points.reshape(grid, grid, 3), (cover > 0.3).reshape(grid, grid), camera)
         nearest = np.floor((np.arange(grid) + 0.5) * cell).astype(np.int32)
         self.depth = query.view.depth[nearest[:, None], nearest]
         self.mask = query.view.mask[nearest[:, None], nearest]
+        self.cloud = Cloud(
+            points.reshape(grid, grid, 3),
+            (cover > 0.3).reshape(grid, grid),
+            camera,
+            self.mask,
+            self.depth,
+            nearest_inside(self.mask),
+        )
 
 
 def _rounds(
@@ -148,7 +164,13 @@ def _rounds(
 
 
 def _improve_and_score(
-    templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config, *, scale_known: bool
+    templates: Templates,
+    query: Query,
+    scene: _Scene,
+    poses: Similarity,
+    config: Config,
+    *,
+    scale_known: bool,
 ) -> tuple[Similarity, Float[Array, "h"]]:
     if config.refine.steps:
         with jax.named_scope("refine"):
@@ -158,6 +180,54 @@ def _improve_and_score(
         camera = scene.cloud.camera
         rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score)
         return poses, jax.vmap(rate)(poses)
+
+
+def _draw_best(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
+    templates: Templates,
+    query: Query,
+    scene: _Scene,
+    found: tuple[Similarity, Int[Array, "n"], Bool[Array, "n"], Float[Array, "n"]],
+    config: Config,
+) -> tuple[Similarity, Int[Array, "k"], Bool[Array, "k"], Float[Array, "k"]]:
+    """The best candidates, each different from the others, scored by what they look like, too."""
+    poses, _, determined, agreement = found
+    agreement = jnp.where(determined, agreement, -1)
+    chosen, ahead = distinct(poses, agreement, min(config.score.drawn, agreement.shape[0]), config.score.apart)
+    poses, parent, determined, _ = jax.tree.map(lambda x: x[chosen], found)
+    appearance = templates.appearance
+    assert appearance is not None
+
+    def rate(pose):
+        depth = depth_agreement(templates.surface, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
+        features = feature_agreement(templates, query, pose, config.score)
+        return depth * features * drawn_agreement(encoder, appearance, templates.mean, query, pose, config.score)
+
+    with jax.named_scope("draw"):
+        # One image at a time is fastest on a CPU; accelerators want them all.
+        score = lax.platform_dependent(poses, cpu=lambda p: lax.map(rate, p), default=jax.vmap(rate))
+    return poses, parent, determined & ahead, score
+
+
+def distinct(
+    poses: Similarity, score: Float[Array, "n"], count: int, apart: float | Float[Array, ""]
+) -> tuple[Int[Array, "k"], Bool[Array, "k"]]:
+    """Indices of the best poses that differ from all better ones, best first, and whether there were so many.
+
+    Args:
+      score: higher is better, negative = absent.
+      apart: the angle in rad below which two poses are one, if their centres are also within 3 % of the diameter.
+    """
+
+    def choose(rest, _):
+        best = jnp.argmax(rest)
+        trace = jnp.sum(poses.rotation * poses.rotation[best], axis=(-2, -1))
+        turned = jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1))
+        moved = jnp.linalg.norm(poses.translation - poses.translation[best], axis=-1)
+        same = (turned < apart) & (moved < 0.03 * poses.scale[best])
+        return jnp.where(same, -1, rest).at[best].set(-1), (best, rest[best] >= 0)
+
+    return lax.scan(choose, score, None, length=count)[1]
 
 
 TURNS = 9  # of one pose: a quarter, half and three quarters about each of three axes

@@ -1,7 +1,8 @@
 """From a coarse similarity to one that fits the depth image: robust least squares on Sim(3) or SE(3).
 
 Both directions are associated: surface points with the depth they project to, and depth points with their nearest
-surface point. One direction alone lets a free scale shrink or grow the object along the rays.
+surface point. One direction alone lets a free scale shrink or grow the object along the rays. Surface that projects
+beside the mask is drawn to its outline, unless something hides it there.
 """
 
 from typing import Any
@@ -12,7 +13,7 @@ import lineax as lx
 import optimistix as optx
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ipjax.cameras import project
 from ipjax.config import RefineConfig
@@ -25,6 +26,28 @@ class Cloud(eqx.Module):
     points: Float[Array, "g g 3"]  # metres, camera frame
     valid: Bool[Array, "g g"]
     camera: Camera  # of the grid: one pixel per cell
+    mask: Bool[Array, "g g"]  # the object, with or without a depth
+    depth: Float[Array, "g g"]  # metres, background included; 0 = unknown
+    outline: Int[Array, "g g 2"]  # (column, row) of the nearest cell of the mask
+
+
+def nearest_inside(mask: Bool[Array, "h w"]) -> Int[Array, "h w 2"]:
+    """For every cell the (column, row) of the nearest cell that is set, the lowest row first; itself where none is.
+
+    Two passes, along the rows and then along the columns, give the exact Euclidean answer.
+    """
+    height, width = mask.shape
+    across = jnp.abs(jnp.arange(width)[:, None] - jnp.arange(width)[None, :])
+    far = height + width
+    steps = jnp.where(mask[:, None, :], across[None], far)  # row, from, to
+    column = jnp.argmin(steps, axis=-1)
+    away = jnp.min(steps, axis=-1)
+    down = jnp.arange(height)[:, None] - jnp.arange(height)[None, :]
+    squared = (down**2)[:, :, None] + (away**2)[None, :, :]  # from row, to row, column
+    row = jnp.argmin(squared, axis=1)
+    found = jnp.stack([jnp.take_along_axis(column, row, axis=0), row], axis=-1)
+    itself = jnp.stack(jnp.meshgrid(jnp.arange(width), jnp.arange(height)), axis=-1)
+    return jnp.where(jnp.any(mask), found, itself).astype(jnp.int32)
 
 
 def refine(
@@ -39,7 +62,7 @@ def refine(
 
     Args:
       surface: the object's surface; its first ``config.points`` points are used.
-      cloud: the masked depth.
+      cloud: the masked depth, and what lies around it.
       camera_from_object: the hypothesis.
       scale_known: leave the scale as it is (SE(3) instead of Sim(3)).
 
@@ -52,8 +75,7 @@ def refine(
     start = camera_from_object
 
     def residuals(step, _):
-        moved = retract(start, step)
-        return _residuals(moved, points, normals, trust, cloud, config)
+        return _residuals(retract(start, step), points, normals, trust, cloud, config)
 
     count = 6 if scale_known else 7
     zero = jnp.zeros(count, start.translation.dtype)
@@ -94,19 +116,45 @@ def _residuals(moved, points, normals, trust, cloud, config):
     facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
     distance = jnp.linalg.norm(placed, axis=-1)
     visible = lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * distance)
-    forward, forward_ok = _project_onto(placed, cloud)
-    forward = _robust(placed - forward, facing, visible & forward_ok, moved.scale, config) * jnp.sqrt(trust)
-    # Surface that faces away from the camera cannot have been measured and costs nothing.
-    forward = jnp.where(visible, forward, 0)
+    column, row, inside = _cells(placed, cloud)
+    measured = cloud.valid[row, column] & inside
+    forward = _robust(placed - cloud.points[row, column], facing, measured, moved.scale, config)
+    beside = _beside(placed, cloud.outline[row, column], moved.scale, cloud.camera, config)
+    on_mask = cloud.mask[row, column] & inside
+    forward = jnp.where(on_mask, forward, beside) * jnp.sqrt(trust)
+    # Surface that faces away, or lies behind an occluder, cannot have been measured and costs nothing.
+    nearer = (cloud.depth[row, column] > 0) & (cloud.depth[row, column] < placed[:, 2] - config.reach * moved.scale / 2)
+    counted = visible & ~lax.stop_gradient(nearer & ~on_mask)
+    forward = jnp.where(counted, forward, 0)
     targets = cloud.points[::2, ::2].reshape(-1, 3)
-    measured = cloud.valid[::2, ::2].reshape(-1)
+    known = cloud.valid[::2, ::2].reshape(-1)
     nearest = lax.stop_gradient(_nearest_visible(targets, placed, visible))
-    backward = _robust(placed[nearest] - targets, facing[nearest], measured, moved.scale, config)
-    backward = jnp.where(measured, backward * jnp.sqrt(trust[nearest]), 0)
-    weigh = lambda count: jnp.sqrt(1 / jnp.maximum(lax.stop_gradient(jnp.sum(count)), 1)).astype(placed.dtype)
-    return jnp.concatenate([forward * weigh(visible), backward * weigh(measured)]) * jnp.sqrt(
-        jnp.asarray(forward.shape[0] + backward.shape[0], placed.dtype) / 2
-    )
+    backward = _robust(placed[nearest] - targets, facing[nearest], known, moved.scale, config)
+    backward = jnp.where(known, backward * jnp.sqrt(trust[nearest]), 0)
+    share = lambda count: lax.stop_gradient(jnp.sum(count))
+    weigh = lambda count: jnp.sqrt(1 / jnp.maximum(count, 1)).astype(placed.dtype)
+    # Hiding most of itself must not pay.
+    terms = [forward * weigh(jnp.maximum(share(counted), share(visible) // 3)), backward * weigh(share(known))]
+    together = jnp.concatenate(terms)
+    return together * jnp.sqrt(jnp.asarray(together.shape[0], placed.dtype) / 2)
+
+
+def _cells(placed, cloud):
+    """The grid cell that each placed point projects to, and whether it is one."""
+    height, width = cloud.valid.shape
+    pixel = lax.stop_gradient(jnp.round(project(cloud.camera, placed))).astype(jnp.int32)
+    inside = jnp.all((pixel >= 0) & (pixel < jnp.array([width, height], jnp.int32)), axis=-1)
+    return jnp.clip(pixel[:, 0], 0, width - 1), jnp.clip(pixel[:, 1], 0, height - 1), inside
+
+
+def _beside(placed, outline, scale, camera, config):
+    """Geman–McClure on the sideways distance to the mask's outline, half a cell of it free, on top of a fixed share:
+    leaving the mask must cost more than fitting badly inside it."""
+    offset = project(camera, placed) - outline.astype(placed.dtype)
+    apart = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
+    metres = jnp.maximum(apart - 0.5, 0) * placed[:, 2] / jnp.mean(camera.focal)
+    squared = (metres / (config.outline_width * scale)) ** 2
+    return jnp.sqrt(0.8 + 0.2 * squared / (1 + squared))
 
 
 def _robust(offset, normal, ok, scale, config):
@@ -117,16 +165,6 @@ def _robust(offset, normal, ok, scale, config):
     squared = (plane**2 + 0.05 * jnp.maximum(tangent, 0)) / (config.width * scale) ** 2
     near = lax.stop_gradient(ok & (jnp.sum(offset * offset, axis=-1) < (config.reach * scale) ** 2))
     return jnp.where(near, jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
-
-
-def _project_onto(placed, cloud):
-    """The measured point that each placed point projects to (nearest cell), and whether there is one."""
-    height, width = cloud.valid.shape
-    pixel = lax.stop_gradient(jnp.round(project(cloud.camera, placed))).astype(jnp.int32)
-    inside = jnp.all((pixel >= 0) & (pixel < jnp.array([width, height], jnp.int32)), axis=-1)
-    column = jnp.clip(pixel[:, 0], 0, width - 1)
-    row = jnp.clip(pixel[:, 1], 0, height - 1)
-    return cloud.points[row, column], inside & cloud.valid[row, column]
 
 
 def _nearest_visible(targets, placed, visible):

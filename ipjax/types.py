@@ -57,6 +57,14 @@ class Surface(eqx.Module):
     seen: Float[Array, "*b n"]  # 1 = measured or observed, 0 = guessed by the reconstruction
 
 
+class Appearance(eqx.Module):
+    """A dense sample of the surface with its colours: the object as it can be drawn again at any pose."""
+
+    points: Float[Array, "*b m 3"]  # model units
+    normals: Float[Array, "*b m 3"]  # unit, outwards
+    colours: Float[Array, "*b m 3"]  # [0, 1]
+
+
 class Templates(eqx.Module):
     """The object, ready to be found: rendered views as patches, their poses, and its surface.
 
@@ -73,6 +81,9 @@ class Templates(eqx.Module):
     surface: Surface
     extents: Float[Array, "*b 3"]  # sides of the axis-aligned bounding box, model units
     axes: Float[Array, "*b 3 3"]  # rows: unit axes of the smallest box around the object, about which it may look alike
+    appearance: Appearance | None = (
+        None  # with it and the encoder, candidates are drawn and compared; None = they are not
+    )
 
 
 class Query(eqx.Module):

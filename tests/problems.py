@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ipjax.features import describe
 from ipjax.host.viewpoints import viewpoints
-from ipjax.types import Camera, Query, Similarity, Surface, Templates, View
+from ipjax.types import Appearance, Camera, Query, Similarity, Surface, Templates, View
 
 AXES = np.array([0.28, 0.38, 0.5])  # semi-axes; the longest makes the diameter 1
 PATCH = 14
@@ -139,3 +139,10 @@ def make_query(
     )
     features = features / jnp.linalg.norm(features, axis=-1, keepdims=True)
     return Query(eqx.tree_at(lambda p: p.features, patches, features), view), truth
+
+
+def make_appearance(count: int) -> Appearance:
+    """The ellipsoid's surface with the colours that `see` gives it."""
+    surface = make_surface(count)
+    colours = 0.5 + 0.45 * surface.points / jnp.asarray(AXES, jnp.float32)
+    return Appearance(surface.points, surface.normals, colours)

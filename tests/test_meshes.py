@@ -16,6 +16,7 @@ from ipjax.host.meshes import (
     load_mesh,
     make_mesh,
     normalise,
+    sample_appearance,
     sample_surface,
     sample_texture,
     save_mesh,
@@ -236,6 +237,26 @@ def test_surface_samples_are_even_repeatable_and_on_the_surface():
     assert gap.min(1).min() > 0.07
     with pytest.raises(ValueError, match="positive"):
         sample_surface(mesh, 0)
+
+
+def test_appearance_is_on_the_surface_in_its_colours():
+    """A quad with a red left and a blue right half of its texture; and one with red and blue corners."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    texture = np.zeros((8, 8, 3), np.uint8)
+    texture[:, :4, 0], texture[:, 4:, 2] = 255, 255
+    textured = make_mesh(corners, faces, uv=corners[:, :2], texture=texture)
+    points, normals, colours = sample_appearance(textured, 500)
+    np.testing.assert_allclose(points[:, 2], 0, atol=1e-6)
+    np.testing.assert_allclose(np.abs(normals), np.tile([0, 0, 1], (500, 1)), atol=1e-6)
+    assert (colours[(points[:, 0] > 0.1) & (points[:, 0] < 0.4), 0] > 200).all()
+    assert (colours[(points[:, 0] > 0.6) & (points[:, 0] < 0.9), 2] > 200).all()
+    painted = make_mesh(corners, faces, colours=np.array([[255, 0, 0], [0, 0, 255]] * 2, np.uint8)[[0, 1, 3, 2]])
+    _, _, mixed = sample_appearance(painted, 500)
+    np.testing.assert_allclose(mixed[:, 0], 255 * (1 - points[:, 0]), atol=2)
+    np.testing.assert_array_equal(sample_appearance(painted, 500)[2], mixed)
+    with pytest.raises(ValueError, match="positive"):
+        sample_appearance(painted, 0)
 
 
 @pytest.mark.parametrize(

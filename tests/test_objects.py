@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ipjax.host.objects import ObjectInfo, check, load, save
-from ipjax.types import Camera, Patches, Similarity, Surface, Templates
+from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates
 
 
 def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templates, ObjectInfo]:
@@ -81,6 +81,18 @@ def test_what_was_saved_comes_back(file):
     np.testing.assert_allclose(told.picture(3)[14, 14], (200, 100, 50), atol=4)  # JPEG
     assert any("mug" in line for line in check(file))
     assert [path.name for path in file.parent.iterdir()] == ["mug.ipjax"]
+
+
+def test_the_appearance_comes_back_to_the_digits_of_its_file(tmp_path):
+    templates, info = make_object()
+    points = np.random.default_rng(1).normal(size=(3, 50, 3))
+    colours = np.abs(points[2]) / np.abs(points[2]).max()
+    look = Appearance(*(jnp.asarray(x, jnp.float32) for x in (points[0], points[1], colours)))
+    again, _ = load(save(tmp_path / "a.ipjax", dataclasses.replace(templates, appearance=look), info))
+    assert again.appearance is not None
+    np.testing.assert_allclose(again.appearance.points, look.points, rtol=1e-3)
+    np.testing.assert_allclose(again.appearance.normals, look.normals, rtol=1e-3)
+    np.testing.assert_allclose(again.appearance.colours, look.colours, atol=0.5 / 255 + 1e-6)
 
 
 def test_a_loaded_object_can_be_saved_again(file, tmp_path):

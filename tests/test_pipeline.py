@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import ipjax
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
+from ipjax.pipeline import distinct
 from ipjax.types import Query, Similarity
 
 TINY = Config(
@@ -181,3 +182,37 @@ def test_objects_padded_to_one_size_equal_the_loop(templates):
         found = jax.tree.map(lambda x, index=index: x[index], together)
         assert int(found.view) == int(alone.view) and int(found.inliers) == int(alone.inliers)
         same(found.camera_from_object, alone.camera_from_object, 1e-3)
+
+
+def test_with_the_encoder_candidates_are_drawn(templates):
+    """An ellipsoid's depth is the same after a half-turn, its colours are not: drawn, the answer is the true one."""
+    encoder = problems.make_encoder()
+    known = dataclasses.replace(templates, appearance=problems.make_appearance(20_000))
+    config = dataclasses.replace(TURNED, score=ScoreConfig(resolution=28, alternates=1, drawn=4))
+    run = jax.jit(ipjax.estimate)
+    for seed in range(4):
+        query, truth = problems.make_query(seed, noise=0.3)
+        found = run(known, query, jax.random.key(0), config, encoder=encoder)
+        assert found.hypotheses.score.shape == (4,)
+        assert bool(jnp.all(jnp.diff(found.hypotheses.score) <= 0))
+        relative = np.asarray(found.camera_from_object.rotation).T @ np.asarray(truth.rotation)
+        assert np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1))) < 15
+    plain = run(templates, query, jax.random.key(0), config, encoder=encoder)
+    assert plain.hypotheses.score.shape[0] > 4  # without an appearance nothing can be drawn
+
+
+@given(seed=st.integers(0, 2**31))
+def test_distinct_poses_are_the_greedy_choice(seed):
+    rng = np.random.default_rng(seed)
+    base = [problems.random_rotation(rng) for _ in range(3)]
+    rotation = np.stack([base[i] for i in rng.integers(0, 3, 12)])
+    translation = np.round(rng.uniform(-1, 1, (12, 3)))
+    score = np.where(rng.random(12) < 0.2, -1, rng.random(12)).astype(np.float32)
+    poses = Similarity(*(jnp.asarray(x, jnp.float32) for x in (rotation, translation, np.ones(12))))
+    chosen, there = jax.jit(distinct, static_argnums=2)(poses, jnp.asarray(score), 6, 0.1)
+    expected: list[int] = []
+    for i in np.argsort(-score, kind="stable"):
+        near = [np.allclose(rotation[i], rotation[j]) and np.allclose(translation[i], translation[j]) for j in expected]
+        if score[i] >= 0 and not any(near) and len(expected) < 6:
+            expected.append(int(i))
+    assert np.asarray(chosen)[np.asarray(there)].tolist() == expected

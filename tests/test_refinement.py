@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ipjax.config import RefineConfig
 from ipjax.features import lift
-from ipjax.refinement import Cloud, refine, retract, rotation_from_vector, solve_positive
+from ipjax.refinement import Cloud, nearest_inside, refine, retract, rotation_from_vector, solve_positive
 from ipjax.types import Camera
 
 CONFIG = RefineConfig(steps=15, points=256)
@@ -24,8 +24,17 @@ def scene():
     points, cover = lift(query.view, 28, 28, 0.05)
     camera = query.view.camera
     camera = Camera(camera.focal / 4, (camera.centre + 0.5) / 4 - 0.5)
-    cloud = Cloud(points.reshape(28, 28, 3), (cover > 0.3).reshape(28, 28), camera)
+    valid = (cover > 0.3).reshape(28, 28)
+    points = points.reshape(28, 28, 3)
+    cloud = Cloud(points, valid, camera, valid, jnp.where(valid, points[..., 2], 0), nearest_inside(valid))
     return problems.make_surface(512), cloud, truth
+
+
+def hide(cloud: Cloud, hidden) -> Cloud:
+    """The same scene with something close to the camera over the cells that are `hidden`."""
+    mask = cloud.mask & ~hidden
+    depth = jnp.where(hidden, 0.3 * jnp.max(cloud.depth), cloud.depth)
+    return Cloud(cloud.points, cloud.valid & ~hidden, cloud.camera, mask, depth, nearest_inside(mask))
 
 
 @given(seed=st.integers(0, 2**31))
@@ -54,10 +63,56 @@ def test_a_known_scale_stays(scene, seed):
 
 def test_without_depth_nothing_moves(scene):
     surface, cloud, truth = scene
-    blind = Cloud(jnp.zeros_like(cloud.points), jnp.zeros_like(cloud.valid), cloud.camera)
+    nothing = jnp.zeros_like(cloud.valid)
+    blind = Cloud(
+        jnp.zeros_like(cloud.points),
+        nothing,
+        cloud.camera,
+        nothing,
+        jnp.zeros_like(cloud.depth),
+        nearest_inside(nothing),
+    )
     found, cost = run(surface, blind, truth, CONFIG)
     assert bool(jnp.isfinite(cost))
     np.testing.assert_allclose(found.translation, truth.translation, atol=1e-6)
+
+
+@given(seed=st.integers(0, 2**31), share=st.floats(0, 0.3))
+def test_the_nearest_cell_of_a_mask(seed, share):
+    mask = np.random.default_rng(seed).random((9, 13)) < share
+    found = np.asarray(jax.jit(nearest_inside)(jnp.asarray(mask)))
+    rows, columns = np.mgrid[:9, :13]
+    if not mask.any():
+        np.testing.assert_array_equal(found, np.stack([columns, rows], axis=-1))
+        return
+    assert mask[found[..., 1], found[..., 0]].all()
+    r, c = np.nonzero(mask)
+    least = ((rows[..., None] - r) ** 2 + (columns[..., None] - c) ** 2).min(-1)
+    np.testing.assert_array_equal((found[..., 0] - columns) ** 2 + (found[..., 1] - rows) ** 2, least)
+
+
+def test_a_mask_alone_pulls_sideways(scene):
+    """No depth at all: what sticks out of the mask still comes back, across the rays."""
+    surface, cloud, truth = scene
+    blind = Cloud(
+        cloud.points, jnp.zeros_like(cloud.valid), cloud.camera, cloud.mask, jnp.zeros_like(cloud.depth), cloud.outline
+    )
+    start = retract(truth, jnp.array([0, 0, 0, 0.15, 0.0, 0.0], jnp.float32))
+    found, _ = run(surface, blind, start, CONFIG, scale_known=True)
+    aside = lambda pose: float(jnp.linalg.norm((pose.translation - truth.translation)[:2])) / float(truth.scale)
+    assert aside(start) > 0.14 and aside(found) < 0.07
+
+
+@pytest.mark.parametrize("side", ["left", "top"])
+def test_what_is_hidden_does_not_count(scene, side):
+    """With a third of the object behind something nearer, the truth stays where it is and keeps its size."""
+    surface, cloud, truth = scene
+    inside = np.argwhere(np.asarray(cloud.mask))
+    row, column = (inside.min(0) + (inside.max(0) - inside.min(0)) / 3).round().astype(int)
+    hidden = jnp.asarray((np.mgrid[:28, :28][1] < column) if side == "left" else (np.mgrid[:28, :28][0] < row))
+    found, _ = run(surface, hide(cloud, hidden), truth, CONFIG)
+    assert abs(float(found.scale / truth.scale) - 1) < 0.03
+    assert float(jnp.linalg.norm(found.translation - truth.translation)) < 0.03 * float(truth.scale)
 
 
 @given(seed=st.integers(0, 2**31))

@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from ipjax.config import ScoreConfig
 from ipjax.refinement import retract
-from ipjax.scoring import closeness, depth_agreement, feature_agreement, look_along
+from ipjax.scoring import closeness, depth_agreement, drawn_agreement, feature_agreement, look_along
 from ipjax.types import Camera
 
 CONFIG = ScoreConfig()
 depth_score = jax.jit(depth_agreement)
 feature_score = jax.jit(feature_agreement)
+drawn_score = jax.jit(drawn_agreement)
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +94,49 @@ def test_nothing_seen_scores_nothing(templates, case):
     assert float(depth_score(templates.surface, jnp.zeros_like(depth), nothing, camera, truth, CONFIG)) == 0
     blind = eqx.tree_at(lambda q: q.view.mask, query, jnp.zeros_like(query.view.mask))
     assert float(feature_score(templates, blind, truth, CONFIG)) == 0
+
+
+@pytest.fixture(scope="module")
+def drawn(case):
+    """The score of a pose by what it looks like, and of one behind an occluder over the left half."""
+    query, *_ = case
+    encoder, appearance = problems.make_encoder(), problems.make_appearance(20_000)
+    mean = jnp.zeros(query.patches.features.shape[-1])
+
+    def rate(pose, query=query):
+        return float(drawn_score(encoder, appearance, mean, query, pose, CONFIG))
+
+    return rate
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_drawing_prefers_the_truth(case, drawn, seed):
+    *_, truth = case
+    best = drawn(truth)
+    assert 0 <= drawn(disturb(truth, seed)) < best <= 1
+    assert best > 0.85  # splats are a pixel wider than the body
+
+
+def test_what_is_hidden_is_not_drawn(case, drawn):
+    """Half behind something near: as good as before. The same half with nothing before it: not there."""
+    query, *_, truth = case
+    side = query.view.depth.shape[0]
+    hidden = jnp.asarray(np.arange(side) < side // 2)[None, :]
+
+    def change(depth):
+        view = query.view
+        mask = view.mask & ~hidden
+        view = type(view)(
+            jnp.where(mask[..., None], view.rgb, 0), jnp.where(hidden, depth, view.depth), mask, view.camera
+        )
+        return type(query)(query.patches, view)
+
+    behind = drawn(truth, change(0.5 * truth.translation[2]))
+    assert behind > 0.9 * drawn(truth)
+    assert drawn(truth, change(2 * truth.translation[2])) < 0.7 * behind
+
+
+def test_out_of_sight_looks_like_nothing(case, drawn):
+    *_, truth = case
+    away = retract(truth, jnp.array([0, 0, 0, 50.0, 0, 0, 0], jnp.float32))
+    assert drawn(away) == 0

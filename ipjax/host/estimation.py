@@ -75,7 +75,7 @@ class Estimator:
         templates, info = self.objects[index]
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)
-        known = {} if diameter is None else {"diameter": jnp.asarray(diameter, jnp.float32)}
+        known: dict[str, Any] = {} if diameter is None else {"diameter": jnp.asarray(diameter, jnp.float32)}
 
         see = self._ready("describe", describe, seconds, self.encoder, view)
         start = time.perf_counter()
@@ -83,6 +83,7 @@ class Estimator:
         seconds["describe"] = time.perf_counter() - start
 
         query = Query(patches=patches, view=view)
+        known["encoder"] = self.encoder
         find = self._ready("estimate", estimate, seconds, templates, query, key, self.config, **known)
         start = time.perf_counter()
         found = jax.block_until_ready(find(templates, query, key, self.config, **known))

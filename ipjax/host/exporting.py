@@ -36,7 +36,8 @@ def to_dictionary(record: Any) -> dict[str, Any]:
     """A record of ``ipjax.types`` as nested dictionaries of arrays, by field name."""
     fields = record.__dataclass_fields__
     values = {name: getattr(record, name) for name in fields}
-    return {name: to_dictionary(x) if hasattr(x, "__dataclass_fields__") else x for name, x in values.items()}
+    present = {name: x for name, x in values.items() if x is not None}
+    return {name: to_dictionary(x) if hasattr(x, "__dataclass_fields__") else x for name, x in present.items()}
 
 
 def _to_templates(tree: dict[str, Any]) -> Templates:

@@ -712,24 +712,45 @@ def sample_surface(
     """
     if count < 1:
         raise ValueError(f"sample_surface needs a positive count, got {count}")
-    random = np.random.Generator(np.random.PCG64(seed))
+    points, normals, face, weights = _scatter(mesh, 5 * count, np.random.Generator(np.random.PCG64(seed)))
+    chosen = farthest_points(points, count)
+    seen = np.einsum("kc,kc->k", weights[chosen], mesh.seen[mesh.faces[face[chosen]]])
+    return points[chosen], normals[chosen], np.clip(np.round(seen, 6), 0, 1)  # weights sum to 1 within rounding
+
+
+def sample_appearance(
+    mesh: Mesh, count: int, seed: int = 0
+) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"], UInt8[np.ndarray, "k 3"]]:
+    """Points spread over the surface by area, their unit normals and their colours; for drawing, so many and cheap.
+
+    Raises ValueError where count is not positive or the mesh has no area.
+    """
+    if count < 1:
+        raise ValueError(f"sample_appearance needs a positive count, got {count}")
+    points, normals, face, weights = _scatter(mesh, count, np.random.Generator(np.random.PCG64(seed)))
+    corners = mesh.faces[face]
+    if mesh.texture is not None and mesh.uv is not None:
+        colours = sample_texture(mesh.texture, np.einsum("kc,kci->ki", weights, mesh.uv[corners]))
+    else:
+        mixed = np.einsum("kc,kci->ki", weights, mesh.colours[corners].astype(np.float64))
+        colours = np.clip(np.round(mixed), 0, 255).astype(np.uint8)
+    return points, normals, colours
+
+
+def _scatter(mesh: Mesh, count: int, random: np.random.Generator):
+    """Points stratified by area, their normals, faces and barycentric weights."""
     products = _corner_products(mesh.vertices, mesh.faces)
     area = np.linalg.norm(products, axis=-1)
     if not area.sum() > 0:
         raise ValueError("the mesh has no area")
-    many = 5 * count
     ladder = np.cumsum(area)
-    face = np.searchsorted(ladder, (np.arange(many) + random.random(many)) / many * ladder[-1], side="right")
+    face = np.searchsorted(ladder, (np.arange(count) + random.random(count)) / count * ladder[-1], side="right")
     face = np.minimum(face, len(area) - 1)
-    a, b = random.random((2, many))
+    a, b = random.random((2, count))
     root = np.sqrt(a)
     weights = np.stack([1 - root, root * (1 - b), root * b], axis=-1)
-    corners = mesh.faces[face]
-    points = np.einsum("kc,kci->ki", weights, mesh.vertices[corners])
-    chosen = farthest_points(points, count)
-    normals = _unit(products[face[chosen]])
-    seen = np.einsum("kc,kc->k", weights[chosen], mesh.seen[corners[chosen]])
-    return points[chosen], normals, np.clip(np.round(seen, 6), 0, 1)  # weights sum to 1 only to within rounding
+    points = np.einsum("kc,kci->ki", weights, mesh.vertices[mesh.faces[face]])
+    return points, _unit(products[face]), face, weights
 
 
 def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " k"]:

@@ -8,6 +8,7 @@ mesh, and a checksum. Tensors, for v templates of p patches with c channels:
     points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
     rotation f32 [v 3 3] · translation f32 [v 3] · focal, centre f32 [v 2]           camera_from_object and its camera
     surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3] · axes f32 [3 3]
+    appearance.points, appearance.normals f16 [m 3] · appearance.colours u8 [m 3]    optional, to draw candidates from
     mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
     pictures u8 [bytes] · pictures.end i64 [v]                                       optional, one JPEG per template
     photo u8 [bytes]                                                                 optional, JPEG of the reference
@@ -26,7 +27,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ipjax.types import Camera, Patches, Similarity, Surface, Templates
+from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates
 
 FORMAT = 1
 SUFFIX = ".ipjax"
@@ -51,6 +52,9 @@ _TEMPLATE_TENSORS = {
     "axes": ("float32", "33"),
 }
 _OPTIONAL_TENSORS = {
+    "appearance.points": ("float16", "m3"),
+    "appearance.normals": ("float16", "m3"),
+    "appearance.colours": ("uint8", "m3"),
     "mesh.vertices": ("float32", "a3"),
     "mesh.faces": ("int32", "b3"),
     "mesh.colours": ("uint8", "a3"),
@@ -230,6 +234,12 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         "extents": templates.extents,
         "axes": templates.axes,
     }
+    if templates.appearance is not None:
+        tensors |= {
+            "appearance.points": templates.appearance.points,
+            "appearance.normals": templates.appearance.normals,
+            "appearance.colours": np.round(255 * np.asarray(templates.appearance.colours)),
+        }
     if np.ndim(patches.features) != 3:
         raise ValueError(
             f"templates of one object have features [views, patches, channels], not {patches.features.shape}"
@@ -324,8 +334,19 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
             ),
             extents=device["extents"],
             axes=device["axes"],
+            appearance=_appearance(tensors),
         ),
         info,
+    )
+
+
+def _appearance(tensors: dict[str, np.ndarray]) -> Appearance | None:
+    if "appearance.points" not in tensors:
+        return None
+    return Appearance(
+        points=jnp.asarray(tensors["appearance.points"], jnp.float32),
+        normals=jnp.asarray(tensors["appearance.normals"], jnp.float32),
+        colours=jnp.asarray(tensors["appearance.colours"].astype(np.float32) / 255),
     )
 
 

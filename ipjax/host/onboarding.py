@@ -12,12 +12,12 @@ from tqdm import tqdm
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.features import centre, describe
-from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_surface, sample_texture
+from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_appearance, sample_surface, sample_texture
 from ipjax.host.objects import ObjectInfo, save
 from ipjax.host.rendering import render
 from ipjax.host.viewpoints import viewpoints
 from ipjax.host.weights import hash_file, load_encoder
-from ipjax.types import Camera, Patches, Similarity, Surface, Templates, View
+from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates, View
 
 
 def framing_cameras(
@@ -51,6 +51,16 @@ def box_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
     box_from_points, _ = trimesh.bounds.oriented_bounds(np.round(points, 4))
     axes = box_from_points[:3, :3]
     return axes * np.sign(np.linalg.det(axes))
+
+
+def make_appearance(mesh: Mesh, count: int) -> Appearance:
+    """``count`` coloured points of a normalised mesh, as drawing candidates takes them; always the same ones."""
+    points, normals, colours = sample_appearance(mesh, count)
+    return Appearance(
+        jnp.asarray(points, jnp.float32),
+        jnp.asarray(normals, jnp.float32),
+        jnp.asarray(colours.astype(np.float32) / 255),
+    )
 
 
 def make_templates(
@@ -92,6 +102,7 @@ def make_templates(
         surface=surface,
         extents=jnp.asarray(np.ptp(mesh.vertices, axis=0), jnp.float32),
         axes=jnp.asarray(box_axes(mesh.vertices[np.unique(mesh.faces)]), jnp.float32),
+        appearance=make_appearance(mesh, config.appearance) if config.appearance else None,
     )
     return templates, views.rgb
 

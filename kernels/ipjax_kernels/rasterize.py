@@ -47,6 +47,40 @@ def splat_depth(
     return jnp.where(jnp.isfinite(image), image, 0)
 
 
+@functools.partial(jax.jit, static_argnames=("height", "width"))
+def splat_colours(
+    points: Float[Array, "n 3"],
+    colours: Float[Array, "n 3"],
+    valid: Bool[Array, " n"],
+    focal: Float[Array, "2"],
+    centre: Float[Array, "2"],
+    height: int,
+    width: int,
+    behind: Float[Array, ""] | float,
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """Image and depth of coloured points in the camera frame; black and 0 where nothing is.
+
+    A pixel has the mean colour of its points that lie at most `behind` behind the nearest one in a 3 × 3 square; a
+    pixel without any, the mean of its neighbours'. Meant for several points per pixel. Otherwise as `splat_depth`.
+    """
+    depth = splat_depth(points, valid, focal, centre, height, width)
+    z = points[:, 2]
+    ahead = valid & (z > 0) & jnp.all(jnp.isfinite(points), axis=-1)
+    pixel = focal * points[:, :2] / jnp.where(ahead, z, 1)[:, None] + centre
+    column, row = jnp.round(jnp.where(ahead[:, None], jnp.clip(pixel, -1e6, 1e6), -1e6)).astype(jnp.int32).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    place = jnp.where(inside, row * width + column, height * width)
+    nearest = depth.reshape(-1).at[place].get(mode="fill", fill_value=-jnp.inf)
+    shown = jnp.where(z <= nearest + behind, place, height * width)
+    paint = jnp.concatenate([colours, jnp.ones_like(colours[:, :1])], axis=-1)
+    sums = jnp.zeros((height * width, 4), colours.dtype).at[shown].add(paint, mode="drop").reshape(height, width, 4)
+    padded = jnp.pad(sums, ((1, 1), (1, 1), (0, 0)))
+    around = sum(padded[i : i + height, j : j + width] for i in range(3) for j in range(3))
+    chosen = jnp.where(sums[..., 3:] > 0, sums, around)
+    image = chosen[..., :3] / jnp.maximum(chosen[..., 3:], 1)
+    return jnp.where((depth > 0)[..., None], image, 0), depth
+
+
 @functools.partial(jax.jit, static_argnames=("height", "width", "tile", "block"))
 def rasterize(
     vertices: Float[Array, "n 3"],

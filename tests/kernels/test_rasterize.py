@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ipjax_kernels import reference_raster
-from ipjax_kernels.rasterize import rasterize, splat_depth
+from ipjax_kernels.rasterize import rasterize, splat_colours, splat_depth
 
 HEIGHT, WIDTH = 13, 17
 FOCAL, CENTRE = np.array([20.0, 22.0], np.float32), np.array([7.3, 6.6], np.float32)
@@ -161,3 +161,23 @@ def test_kernels_lower_without_callbacks():
         lambda v: rasterize(v, jnp.asarray(faces), jnp.asarray(FOCAL), jnp.asarray(CENTRE), HEIGHT, WIDTH)
     ).lower(jnp.asarray(vertices))
     assert "callback" not in text.as_text()
+
+
+@given(st.integers(0, 2**31))
+def test_splat_colours_paints_the_nearest(seed):
+    """Two sheets of points, the nearer over the left half: its colour there, the other's elsewhere, black outside."""
+    rng = np.random.default_rng(seed)
+    near = np.concatenate([rng.uniform([-1, -1], [0, 1], (4000, 2)), np.full((4000, 1), 1.0)], axis=1)
+    far = np.concatenate([rng.uniform(-2, 2, (8000, 2)), np.full((8000, 1), 2.0)], axis=1)
+    points = jnp.asarray(np.concatenate([near, far]), jnp.float32)
+    red, blue = np.array([0.9, 0.1, 0.2]), np.array([0.2, 0.3, 0.8])
+    colours = jnp.asarray(np.concatenate([np.tile(red, (4000, 1)), np.tile(blue, (8000, 1))]), jnp.float32)
+    valid = jnp.ones(12000, bool)
+    focal, centre = jnp.full(2, 8.0), jnp.full(2, 15.5)
+    image, depth = splat_colours(points, colours, valid, focal, centre, 32, 32, 0.1)
+    np.testing.assert_array_equal(depth, splat_depth(points, valid, focal, centre, 32, 32))
+    np.testing.assert_allclose(image[10:22, 10:14], np.broadcast_to(red, (12, 4, 3)), atol=1e-5)
+    np.testing.assert_allclose(image[10:22, 18:22], np.broadcast_to(blue, (12, 4, 3)), atol=1e-5)
+    assert not np.asarray(image)[np.asarray(depth) == 0].any() and (np.asarray(depth)[:5] == 0).all()
+    nothing, empty = splat_colours(points, colours, ~valid, focal, centre, 32, 32, 0.1)
+    assert not np.asarray(nothing).any() and not np.asarray(empty).any()
