@@ -228,6 +228,7 @@ def consensus(
     with jax.named_scope("fit"):
         chosen_source = jnp.moveaxis(source.T[:, table.T], 0, 1)  # (m, 3, n): the batch axis last
         chosen_target = jnp.moveaxis(target.T[:, table.T], 0, 1)
+        chosen_source, chosen_target = jax.lax.optimization_barrier((chosen_source, chosen_target))
         ones = jnp.ones(table.T.shape, source.dtype)
         rotation, translation, scale, spread_found, success = fit_batch_last(chosen_source, chosen_target, ones)
         success = success & (spread_found >= spread) & jnp.all(weight[table] > 0, axis=1)

@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 # Rounding may turn the rotation by at most about 1 / _MARGIN radians before ``success`` denies it.
 _MARGIN = 128.0
+# Up to so many points are summed one by one.
+_FEW = 8
 
 
 @partial(jax.jit, static_argnames="with_scale")
@@ -87,7 +89,11 @@ def fit_batch_last(
     target_arm = tuple(target[:, axis] - target_mean[axis] for axis in range(3))
     # The barriers part what the CPU compiler would otherwise compute once for each of its readers.
     share, source_arm, target_arm = _part((share, source_arm, target_arm))
-    covariance = jnp.stack([jnp.stack([_sum(share * t * s) for s in source_arm]) for t in target_arm])
+    if source.shape[0] <= _FEW:
+        covariance = jnp.stack([jnp.stack([_sum(share * t * s) for s in source_arm]) for t in target_arm])
+    else:
+        weighted_arm = jnp.stack([share * t for t in target_arm], axis=1)
+        covariance = jnp.sum(weighted_arm[:, :, None] * jnp.stack(source_arm, axis=1)[:, None, :], axis=0)
     variance = _sum(share * _dot(source_arm, source_arm))
     target_variance = _sum(share * _dot(target_arm, target_arm))
     if source.shape[0] == 3:
@@ -157,11 +163,10 @@ def _polar_of_triangles(matrix, share, source, target):
         for (e1, e2), corner in zip((before, after), corners, strict=True)
     ]
     xx, xy, yx, yy = (
-        _sum(jnp.stack([share[i] * flat[1][i][row] * flat[0][i][column] for i in range(3)]))
-        for row in (0, 1)
-        for column in (0, 1)
+        _dot(share, [flat[1][i][row] * flat[0][i][column] for i in range(3)]) for row in (0, 1) for column in (0, 1)
     )
     straight, over = (xx + yy, yx - xy), (xx - yy, yx + xy)
+    straight, over = _part((straight, over))
     straight_trace, over_trace = (jnp.sqrt(c * c + s * s) for c, s in (straight, over))
     turned = over_trace > straight_trace
     trace = jnp.where(turned, over_trace, straight_trace)
@@ -169,6 +174,7 @@ def _polar_of_triangles(matrix, share, source, target):
     cosine = jnp.where(known, jnp.where(turned, over[0], straight[0]) / jnp.where(known, trace, 1), 1)
     sine = jnp.where(known, jnp.where(turned, over[1], straight[1]) / jnp.where(known, trace, 1), 0)
     sign = jnp.where(turned, -1, 1).astype(trace.dtype)
+    cosine, sine, sign = _part((cosine, sine, sign))
     image_1 = tuple(cosine * a + sine * b for a, b in zip(*after, strict=True))
     image_2 = tuple(sign * (cosine * b - sine * a) for a, b in zip(*after, strict=True))
     image_1, image_2 = _part((image_1, image_2))
@@ -296,7 +302,7 @@ def _decompose_vmap(size, batched, matrix):
 
 def _sum(values):
     """Over the first axis; of a few values one after the other, because a short reduction does not vectorise."""
-    return sum(values[1:], values[0]) if values.shape[0] <= 8 else jnp.sum(values, axis=0)
+    return sum(values[1:], values[0]) if values.shape[0] <= _FEW else jnp.sum(values, axis=0)
 
 
 def _part(values):
@@ -336,6 +342,7 @@ def _reach(vector):
 
 def _combine(left, right):
     """The matrices Σ left · rightᵀ."""
+    left, right = _part((left, right))
     entry = lambda row, column: sum(a[row] * b[column] for a, b in zip(left[1:], right[1:], strict=True))
     return jnp.stack(
         [jnp.stack([left[0][row] * right[0][column] + entry(row, column) for column in range(3)]) for row in range(3)]
