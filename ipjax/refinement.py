@@ -133,7 +133,11 @@ def _nearest_visible(targets, placed, visible):
     squared = jnp.zeros((targets.shape[0], placed.shape[0]), placed.dtype)
     for axis in range(3):  # three fused outer differences: faster and more exact than the expanded product
         squared = squared + (targets[:, None, axis] - placed[None, :, axis]) ** 2
-    return jnp.argmin(jnp.where(visible[None, :], squared, jnp.inf), axis=1)
+    squared = lax.optimization_barrier(jnp.where(visible[None, :], squared, jnp.inf))
+    # The smallest index of the minimum, as two plain reductions: they vectorise on a CPU, an argmin does not.
+    least = lax.optimization_barrier(jnp.min(squared, axis=1, keepdims=True))
+    index = lax.broadcasted_iota(jnp.int32, squared.shape, 1)
+    return jnp.min(jnp.where(squared == least, index, squared.shape[1] - 1), axis=1)
 
 
 class NormalCholesky(lx.AbstractLinearSolver):
