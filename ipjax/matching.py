@@ -41,7 +41,7 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     chosen = None
     if config.shortlist is not None and config.shortlist < every:
         with jax.named_scope("shortlist"):
-            chosen = jnp.sort(lax.top_k(resemblance(query, patches), config.shortlist)[1])
+            chosen = jnp.sort(lax.top_k(resemblance(patches, query), config.shortlist)[1])
             patches = jax.tree.map(lambda x: x[chosen], patches)
     found = nearest(query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes)
     distance = jax.vmap(cycle_distance, (0, 0, None, None, 0))(
@@ -81,14 +81,14 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
 CELLS = 2  # on a side: of the grid that patches are pooled in to be compared at a glance
 
 
-def resemblance(query: Patches, templates: Patches) -> Float[Array, "v"]:
+def resemblance(templates: Patches, query: Patches) -> Float[Array, "v"]:
     """Cosine in [-1, 1] between the query and every template as wholes: by the mean directions in 2 × 2 cells.
 
     One pass over the templates' features, without a similarity between patches.
 
     Args:
+      templates: patches ``v q`` on a grid that covers the same part of the object as the query's.
       query: patches ``p`` of a square crop.
-      templates: patches ``v q`` on a grid that covers the same part of the object.
     """
     within = lambda grid: jnp.floor(grid * (CELLS / (jnp.max(grid, initial=0) + 1)) + 1e-4).astype(jnp.int32)
     cells = jnp.arange(CELLS**2, dtype=jnp.int32)[:, None]

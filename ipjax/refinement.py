@@ -100,7 +100,7 @@ def _residuals(moved, points, normals, trust, cloud, config):
     forward = jnp.where(visible, forward, 0)
     targets = cloud.points[::2, ::2].reshape(-1, 3)
     measured = cloud.valid[::2, ::2].reshape(-1)
-    nearest = _nearest_visible(*lax.stop_gradient((targets, placed, visible)))
+    nearest = lax.stop_gradient(_nearest_visible(targets, placed, visible))
     backward = _robust(placed[nearest] - targets, facing[nearest], measured, moved.scale, config)
     backward = jnp.where(measured, backward * jnp.sqrt(trust[nearest]), 0)
     weigh = lambda count: jnp.sqrt(1 / jnp.maximum(lax.stop_gradient(jnp.sum(count)), 1)).astype(placed.dtype)
@@ -163,7 +163,8 @@ def _nearest_visible(targets, placed, visible):
             squared = squared + (targets[:, None, axis] - placed[None, :, axis]) ** 2
         return lax.argmin(jnp.where(visible[None, :], squared, jnp.inf), 1, jnp.int32)
 
-    return lax.platform_dependent(targets, placed, visible, cpu=by_points, default=at_once)
+    arguments = lax.stop_gradient((targets, placed, visible))
+    return lax.platform_dependent(*arguments, cpu=by_points, default=at_once)
 
 
 class NormalCholesky(lx.AbstractLinearSolver):

@@ -150,7 +150,7 @@ def test_a_shortlist_searches_the_likeliest_templates_only(templates, query, see
     """What it finds is what the exhaustive search finds among them; the others rank below, alike."""
     rng = np.random.default_rng(seed)
     masked = eqx.tree_at(lambda q: q.valid, query, jnp.asarray(np.asarray(query.valid) & (rng.random(64) < 0.8)))
-    listed = np.sort(np.argsort(-np.asarray(resemblance(masked, templates.patches)), kind="stable")[:3])
+    listed = np.sort(np.argsort(-np.asarray(resemblance(templates.patches, masked)), kind="stable")[:3])
     fewer = jax.tree.map(lambda x: x[listed], templates.patches)
     reference = match(masked, eqx.tree_at(lambda t: t.patches, templates, fewer), MatchConfig(views=2))
     found = match(masked, templates, MatchConfig(views=2, shortlist=3))
@@ -166,10 +166,10 @@ def test_the_shortlist_holds_the_template_that_is_the_query(templates):
     """A template asked for itself resembles itself most, with other numbers of patches and in any order."""
     for view in range(8):
         patches = jax.tree.map(lambda x, view=view: x[view, ::-1], templates.patches)
-        alike = np.asarray(resemblance(patches, templates.patches))
+        alike = np.asarray(resemblance(templates.patches, patches))
         assert alike.argmax() == view and abs(alike[view] - 1) < 1e-5
-        compacted = compact(templates, 8).patches
-        np.testing.assert_allclose(resemblance(patches, compacted), alike, atol=1e-5)
+        compacted = compact(templates, multiple=8).patches
+        np.testing.assert_allclose(resemblance(compacted, patches), alike, atol=1e-5)
 
 
 def test_a_shortlist_as_long_as_the_object_changes_nothing(templates, query):
@@ -182,7 +182,7 @@ def test_a_shortlist_as_long_as_the_object_changes_nothing(templates, query):
 
 @pytest.mark.parametrize("ranking", ["cyclic", "cosine"])
 def test_compact_templates_give_the_same_matches(templates, query, ranking):
-    small = compact(templates, 8)
+    small = compact(templates, multiple=8)
     count = small.patches.valid.shape[1]
     most = int(templates.patches.valid.sum(axis=1).max())
     assert count % 8 == 0 and most < count <= most + 8 and count < 64
@@ -202,11 +202,13 @@ def test_compact_templates_give_the_same_matches(templates, query, ranking):
 
 def test_compact_leaves_full_templates_alone_and_refuses_others(templates):
     full = eqx.tree_at(lambda t: t.patches.valid, templates, jnp.ones_like(templates.patches.valid))
-    assert compact(full, 8) is full
-    none = compact(eqx.tree_at(lambda t: t.patches.valid, templates, jnp.zeros_like(templates.patches.valid)), 8)
+    assert compact(full, multiple=8) is full
+    none = compact(
+        eqx.tree_at(lambda t: t.patches.valid, templates, jnp.zeros_like(templates.patches.valid)), multiple=8
+    )
     assert none.patches.valid.shape == (8, 8) and not np.any(none.patches.valid)
     with pytest.raises(ValueError, match="positive multiple"):
-        compact(templates, 0)
+        compact(templates, multiple=0)
 
 
 def test_the_shortlist_needs_no_copy_of_the_templates():

@@ -288,7 +288,7 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
     return path
 
 
-def compact(templates: Templates, multiple: int = 32) -> Templates:
+def compact(templates: Templates, *, multiple: int = 32) -> Templates:
     """Templates with fewer patches each, and the same answers: most of an image is background.
 
     The valid patches come first, in their old order, then as many others as make all templates alike: a multiple of
