@@ -55,7 +55,7 @@ def measure(views, patches, channels, dtype, repeats):
         forms["nearest (pallas)"] = partial(nearest, dtype=dtype, implementation="pallas")
     built = {name: compile_fresh(form, *arguments) for name, form in forms.items()}
     calls = {name: partial(compiled, *arguments) for name, (compiled, _, _) in built.items()}
-    times = time_in_turns(calls, repeats)
+    times = time_in_turns(calls, repeats, seconds=12)
     base = np.median(times["product, view by view"])
     large = np.median(times["one large product"])
     for name, (_, seconds, temporary) in built.items():

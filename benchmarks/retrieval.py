@@ -106,7 +106,8 @@ def main() -> None:
         for n in options.shortlist
     }
     found: dict[tuple[str, int], list[dict[str, float]]] = {}
-    for _, templates, crops in queries(Dataset(options.data), options.objects, encoder, options.most):
+    for obj_id, templates, crops in queries(Dataset(options.data), options.objects, encoder, options.most):
+        print(f"object {obj_id}: {len(crops)} crops, {templates.norm.shape[1]} patches a template", flush=True)
         bases = {n: principal(templates, n) for n in options.channels}
         cut = {n: eqx.tree_at(lambda t: t.patches, templates, project(templates.patches, b)) for n, b in bases.items()}
         for query in crops:

@@ -21,7 +21,7 @@ from ipjax.scoring import score
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
 import problems
 
-BATCHES = (2, 8)  # queries at once
+BATCHES = (8,)  # queries at once
 ACCELERATOR_BATCHES = (16, 64)
 
 
@@ -47,7 +47,6 @@ def rows(quick: bool):
             (f"refine, {poses.scale.shape[0]} hypotheses", fewer): (refine_all, (small, query, poses, Config())),
             (f"score, {poses.scale.shape[0]} hypotheses", fewer): (score_all, (small, query, poses, Config())),
             ("estimate, Config.paper()", size): (estimate, (templates, query, key, Config.paper())),
-            ("estimate, Config()", size): (estimate, (templates, query, key, Config())),
             ("estimate, Config(), compact templates", fewer): (estimate, (small, query, key, Config())),
         },
         repeats,
@@ -130,7 +129,10 @@ def write_trace(folder: Path):
 
 def measure(forms, repeats, seconds):
     """Rows of ``(name, size): (function, arguments)``, in turns."""
-    built = {label: compile_fresh(form, *arguments) for label, (form, arguments) in forms.items()}
+    built = {}
+    for (name, size), (form, arguments) in forms.items():
+        built[name, size] = compile_fresh(form, *arguments)
+        print(f"  compiled: {name}, {size}", flush=True)
     calls = {label: partial(built[label][0], *arguments) for label, (_, arguments) in forms.items()}
     for (name, size), times in time_in_turns(calls, repeats, seconds=seconds).items():
         yield row(name, size, built[name, size], times)
