@@ -71,7 +71,7 @@ format: $(READY)
 	$(BIN)/ruff format .
 
 bench: $(READY)
-	$(RUN) -m benchmarks
+	$(RUN) -m benchmarks --json out/benchmarks.json
 
 # Objects are onboarded once, into the cache, and shared by both runs; killed and called again, it goes on.
 # WEIGHTS=file of the encoder, e.g. WEIGHTS=../shared/data/weights/dinov2_vits14_rederived_fp16.safetensors

@@ -1,4 +1,7 @@
-"""``python -m benchmarks [--only NAME] [--json FILE] [--quick]``: measure on this machine, print the table."""
+"""``python -m benchmarks [--only NAME] [--json FILE] [--quick]``: measure on this machine, print the table.
+
+``--trace FOLDER`` writes a profile of warm estimates instead; https://ui.perfetto.dev opens its ``.json.gz``.
+"""
 
 import argparse
 import json
@@ -23,11 +26,19 @@ def benchmarks():
 
 def main():
     available = benchmarks()
-    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.split("\n")[0])
     parser.add_argument("--only", choices=list(available), action="append", help="measure this one; may be repeated")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the results here")
     parser.add_argument("--quick", action="store_true", help="small sizes, few runs: does it work?")
+    parser.add_argument("--trace", type=Path, metavar="FOLDER", help="write a profile of warm estimates here instead")
     options = parser.parse_args()
+    if options.trace:
+        from benchmarks.stages import write_trace
+
+        write_trace(options.trace)
+        print(*sorted(options.trace.rglob("*.json.gz")))
+        return
+    begin = time.perf_counter()
     results = {**describe_device(), "date": time.strftime("%Y-%m-%d"), "quick": options.quick, "rows": []}
     for name, rows in available.items():
         if options.only and name not in options.only:
@@ -35,10 +46,11 @@ def main():
         for row in rows(options.quick):
             results["rows"].append({key: float(x) if hasattr(x, "dtype") else x for key, x in row.items()})
             print(f"{row['name']}: {row['implementation']}, {row['size']}, {row['dtype']}", flush=True)
+    results["seconds"] = round(time.perf_counter() - begin, 1)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
-    print("\n" + render(results))
+    print(f"\n{results['seconds']:.0f} s in all\n\n" + render(results))
 
 
 main()

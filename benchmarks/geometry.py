@@ -13,12 +13,13 @@ from benchmarks.measure import compile_fresh, summarise, time_in_turns
 
 
 def umeyama_rows(quick: bool):
-    """4096 sets of three points."""
+    """4096 sets of three points (closed form) and of four (an iteration)."""
     count = 512 if quick else 4096
-    source, target = np.random.default_rng(0).standard_normal((2, count, 3, 3), dtype=np.float32)
-    arguments = jnp.asarray(source), jnp.asarray(target), jnp.ones((count, 3))
-    forms = {"umeyama": umeyama, "vmapped jnp.linalg.svd": jax.vmap(library_svd)}
-    yield from compare("umeyama", f"{count} × 3 points", forms, arguments, repeats=7 if quick else 25)
+    for points in (3, 4):
+        source, target = np.random.default_rng(0).standard_normal((2, count, points, 3), dtype=np.float32)
+        arguments = jnp.asarray(source), jnp.asarray(target), jnp.ones((count, points))
+        forms = {"umeyama": umeyama, "vmapped jnp.linalg.svd": jax.vmap(library_svd)}
+        yield from compare("umeyama", f"{count} × {points} points", forms, arguments, repeats=7 if quick else 25)
 
 
 def consensus_rows(quick: bool):

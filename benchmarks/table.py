@@ -14,6 +14,7 @@ COLUMNS = {
     "size": lambda row: row["size"],
     "dtype": lambda row: row["dtype"],
     "median": lambda row: milliseconds(row.get("median_ms")),
+    "fastest": lambda row: milliseconds(row.get("fastest_ms")),
     "quartiles": lambda row: (
         f"{milliseconds(row['quartile_1_ms'])} – {milliseconds(row['quartile_3_ms'])}" if "quartile_1_ms" in row else ""
     ),
@@ -48,6 +49,8 @@ def ratio(row: dict) -> str:
         return f"{row['ratio_to_product']:.2f} × product, {row['ratio_to_large_product']:.2f} × large product"
     if "ratio_to_kernel" in row:
         return f"{row['ratio_to_kernel']:.3g} × kernel"
+    if "queries_per_s" in row:
+        return f"{row['queries_per_s']:.3g} queries/s"
     return f"{100 * row['disagreement']:.2g} %" if "disagreement" in row else ""
 
 

@@ -11,7 +11,7 @@ from ipjax.types import Camera, Patches, PoseEstimate, Query, Similarity, Surfac
 if TYPE_CHECKING:
     from ipjax.host.drawing import draw
     from ipjax.host.frames import frame
-    from ipjax.host.objects import load, save
+    from ipjax.host.objects import compact, load, save
     from ipjax.host.onboarding import onboard
     from ipjax.host.weights import load_encoder
 
@@ -32,6 +32,7 @@ __all__ = [
     "Surface",
     "Templates",
     "View",
+    "compact",
     "describe",
     "draw",
     "estimate",
@@ -45,6 +46,7 @@ __all__ = [
 
 # What needs OpenCV, MuJoCo or files is imported when it is first used.
 _HOST = {
+    "compact": "objects",
     "draw": "drawing",
     "frame": "frames",
     "load": "objects",

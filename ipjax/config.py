@@ -29,6 +29,7 @@ class MatchConfig(eqx.Module):
     pairs: int = _static(256)  # most pairs of each (the paper's K)
     cycle: float = 1.5  # longest cycle of a pair, patches; inf in the paper
     memory_bytes: int = _static(64 * 2**20)  # bound on the similarities held at once
+    shortlist: int | None = _static(None)  # templates searched patch by patch, the likeliest by pooled features; all
 
 
 class AlignConfig(eqx.Module):

@@ -16,6 +16,8 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     The cycle starts at the query (Eq. 2–4); masks enter before every argmax. ``ranking='cyclic'`` is Eq. 5, the sum
     of the K smallest distances, with ties (the rule, not the exception, on a patch grid) broken by the sum of their
     cosines. ``ranking='cosine'`` sums the cosines of all cycles no longer than ``config.cycle``.
+    With ``config.shortlist`` only so many templates are searched, those of most :func:`resemblance`; the others rank
+    one below the last of these.
 
     Args:
       query: patches ``p`` of the crop, centred if the templates' are.
@@ -25,14 +27,22 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
       ``config.views`` templates with ``config.pairs`` pairs each, ordered by distance, then cosine, then patch.
 
     Raises:
-      ValueError: the features of the two sides differ in length.
+      ValueError: the features of the two sides differ in length, or the shortlist is empty.
     """
+    if config.shortlist is not None and config.shortlist < 1:
+        raise ValueError(f"the shortlist must hold at least one template, not {config.shortlist}")
     if query.features.shape[-1] != templates.patches.features.shape[-1]:
         raise ValueError(
             f"the query's features have {query.features.shape[-1]} channels and the templates' "
             f"{templates.patches.features.shape[-1]}: they must come from the same encoder"
         )
     patches = templates.patches
+    every = patches.valid.shape[0]
+    chosen = None
+    if config.shortlist is not None and config.shortlist < every:
+        with jax.named_scope("shortlist"):
+            chosen = jnp.sort(lax.top_k(resemblance(patches, query), config.shortlist)[1])
+            patches = jax.tree.map(lambda x: x[chosen], patches)
     found = nearest(query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes)
     distance = jax.vmap(cycle_distance, (0, 0, None, None, 0))(
         found.query_to_template, found.template_to_query, query.grid, query.valid, patches.valid
@@ -54,14 +64,45 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         view = lax.top_k(ranking, min(config.views, ranking.shape[0]))[1]
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]
+    template = jnp.take_along_axis(found.query_to_template[view], order, axis=1)
+    if chosen is not None:
+        ranking = jnp.full(every, jnp.min(ranking) - 1).at[chosen].set(ranking)
+        view = chosen[view]
     return Matches(
         ranking=ranking,
         view=view,
         query=order,
-        template=jnp.take_along_axis(found.query_to_template[view], order, axis=1),
+        template=template,
         distance=near[:, :pairs],
         similarity=cosine[:, :pairs],
     )
+
+
+CELLS = 2  # on a side: of the grid that patches are pooled in to be compared at a glance
+
+
+def resemblance(templates: Patches, query: Patches) -> Float[Array, "v"]:
+    """Cosine in [-1, 1] between the query and every template as wholes: by the mean directions in 2 × 2 cells.
+
+    One pass over the templates' features, without a similarity between patches.
+
+    Args:
+      templates: patches ``v q`` on a grid that covers the same part of the object as the query's.
+      query: patches ``p`` of a square crop.
+    """
+    within = lambda grid: jnp.floor(grid * (CELLS / (jnp.max(grid, initial=0) + 1)) + 1e-4).astype(jnp.int32)
+    cells = jnp.arange(CELLS**2, dtype=jnp.int32)[:, None]
+
+    def pool(features, cell, valid):
+        inside = (cells == cell[:, 1] * CELLS + cell[:, 0]) & valid
+        total = jnp.dot(inside.astype(jnp.float32), features.astype(jnp.float32), precision="highest")
+        cell_norm = jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True))
+        total = total / jnp.maximum(cell_norm, 1e-9)
+        return total / jnp.maximum(jnp.sqrt(jnp.sum(total * total)), 1e-9)
+
+    whole = pool(query.features, within(query.grid), query.valid)
+    one = lambda template: jnp.sum(pool(*template) * whole)
+    return lax.map(one, (templates.features, within(templates.grid), templates.valid))
 
 
 def _order(distance: Float[Array, "p"], similarity: Float[Array, "p"]):

@@ -167,11 +167,42 @@ def _robust(offset, normal, ok, scale, config):
     return jnp.where(near, jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
 
 
+_TOGETHER = 8  # points compared in one step on a CPU
+
+
 def _nearest_visible(targets, placed, visible):
-    squared = jnp.zeros((targets.shape[0], placed.shape[0]), placed.dtype)
-    for axis in range(3):  # three fused outer differences: faster and more exact than the expanded product
-        squared = squared + (targets[:, None, axis] - placed[None, :, axis]) ** 2
-    return jnp.argmin(jnp.where(visible[None, :], squared, jnp.inf), axis=1)
+    """Index of the nearest visible point for each target; the first of equals, and the first point if none is."""
+
+    def by_points(targets, placed, visible):
+        # A CPU vectorises neither an argmin nor a minimum along the last axis. This compares a few points at a time
+        # with the nearest so far of all targets.
+        count = placed.shape[0]
+        padding = -count % _TOGETHER
+        parts = (
+            jnp.pad(placed, ((0, padding), (0, 0))).reshape(-1, _TOGETHER, 3),
+            jnp.pad(visible, (0, padding)).reshape(-1, _TOGETHER),
+            jnp.arange(count + padding, dtype=jnp.int32).reshape(-1, _TOGETHER),
+        )
+
+        def compare(best, part):
+            least, nearest = best
+            for point, seen, index in zip(*part, strict=True):
+                squared = sum((targets[:, axis] - point[axis]) ** 2 for axis in range(3))
+                nearer = seen & (squared < least)
+                least, nearest = jnp.where(nearer, squared, least), jnp.where(nearer, index, nearest)
+            return (least, nearest), None
+
+        start = jnp.full(targets.shape[0], jnp.inf, placed.dtype), jnp.zeros(targets.shape[0], jnp.int32)
+        return lax.scan(compare, start, parts)[0][1]
+
+    def at_once(targets, placed, visible):
+        squared = jnp.zeros((targets.shape[0], placed.shape[0]), placed.dtype)
+        for axis in range(3):  # three fused outer differences: faster and more exact than the expanded product
+            squared = squared + (targets[:, None, axis] - placed[None, :, axis]) ** 2
+        return lax.argmin(jnp.where(visible[None, :], squared, jnp.inf), 1, jnp.int32)
+
+    arguments = lax.stop_gradient((targets, placed, visible))
+    return lax.platform_dependent(*arguments, cpu=by_points, default=at_once)
 
 
 class NormalCholesky(lx.AbstractLinearSolver):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ipjax.features import describe
 from ipjax.host.viewpoints import viewpoints
-from ipjax.types import Appearance, Camera, Query, Similarity, Surface, Templates, View
+from ipjax.types import Appearance, Camera, Patches, Query, Similarity, Surface, Templates, View
 
 AXES = np.array([0.28, 0.38, 0.5])  # semi-axes; the longest makes the diameter 1
 PATCH = 14
@@ -103,6 +103,27 @@ def make_templates(directions: int = 8, rolls: int = 1, grid: int = 8, channels:
         surface=make_surface(512),
         extents=jnp.asarray(2 * AXES, jnp.float32),
         axes=jnp.eye(3, dtype=jnp.float32),
+    )
+
+
+def blank_templates(views: int, patches: int, channels: int) -> Templates:
+    """Half-precision templates of zeros: shapes for the compiler."""
+    zeros = lambda *shape: jnp.zeros(shape, jnp.float32)
+    return Templates(
+        Patches(
+            jnp.zeros((views, patches, channels), jnp.float16),
+            zeros(views, patches, 3),
+            zeros(views, patches, 2),
+            jnp.zeros((views, patches), bool),
+        ),
+        zeros(channels),
+        zeros(views, patches),
+        zeros(views, patches),
+        Similarity(zeros(views, 3, 3), zeros(views, 3), zeros(views)),
+        Camera(zeros(views, 2), zeros(views, 2)),
+        Surface(zeros(64, 3), zeros(64, 3), zeros(64)),
+        zeros(3),
+        zeros(3, 3),
     )
 
 

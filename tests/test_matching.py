@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipjax.config import Config, MatchConfig
-from ipjax.matching import match, select
+from ipjax.host.objects import compact
+from ipjax.matching import match, resemblance, select
 from ipjax.types import Camera, Patches, Similarity, Surface, Templates
 
 
@@ -142,3 +143,81 @@ def test_channels_must_agree(templates, query):
             match(short, templates)
     finally:
         config.update("jaxtyping_disable", False)
+
+
+@given(st.integers(0, 2**31))
+def test_a_shortlist_searches_the_likeliest_templates_only(templates, query, seed):
+    """What it finds is what the exhaustive search finds among them; the others rank below, alike."""
+    rng = np.random.default_rng(seed)
+    masked = eqx.tree_at(lambda q: q.valid, query, jnp.asarray(np.asarray(query.valid) & (rng.random(64) < 0.8)))
+    listed = np.sort(np.argsort(-np.asarray(resemblance(templates.patches, masked)), kind="stable")[:3])
+    fewer = jax.tree.map(lambda x: x[listed], templates.patches)
+    reference = match(masked, eqx.tree_at(lambda t: t.patches, templates, fewer), MatchConfig(views=2))
+    found = match(masked, templates, MatchConfig(views=2, shortlist=3))
+    np.testing.assert_array_equal(found.view, listed[np.asarray(reference.view)])
+    np.testing.assert_allclose(np.asarray(found.ranking)[listed], reference.ranking, atol=1e-6)
+    for name in ("query", "template"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(reference, name))
+    others = np.delete(np.asarray(found.ranking), listed)
+    assert np.all(others < np.asarray(reference.ranking).min()) and np.all(np.isfinite(others))
+
+
+def test_the_shortlist_holds_the_template_that_is_the_query(templates):
+    """A template asked for itself resembles itself most, with other numbers of patches and in any order."""
+    for view in range(8):
+        patches = jax.tree.map(lambda x, view=view: x[view, ::-1], templates.patches)
+        alike = np.asarray(resemblance(templates.patches, patches))
+        assert alike.argmax() == view and abs(alike[view] - 1) < 1e-5
+        compacted = compact(templates, multiple=8).patches
+        np.testing.assert_allclose(resemblance(compacted, patches), alike, atol=1e-5)
+
+
+def test_a_shortlist_as_long_as_the_object_changes_nothing(templates, query):
+    plain, listed = (match(query, templates, MatchConfig(shortlist=n)) for n in (None, 8))
+    for one, other in zip(jax.tree.leaves(plain), jax.tree.leaves(listed), strict=True):
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(ValueError, match="at least one template"):
+        match(query, templates, MatchConfig(shortlist=0))
+
+
+@pytest.mark.parametrize("ranking", ["cyclic", "cosine"])
+def test_compact_templates_give_the_same_matches(templates, query, ranking):
+    small = compact(templates, multiple=8)
+    count = small.patches.valid.shape[1]
+    most = int(templates.patches.valid.sum(axis=1).max())
+    assert count % 8 == 0 and most < count <= most + 8 and count < 64
+    np.testing.assert_array_equal(small.patches.grid.max(axis=(1, 2)), 7)  # the grid's size can still be told
+    config = MatchConfig(ranking=ranking)
+    whole, cut = match(query, templates, config), match(query, small, config)
+    np.testing.assert_array_equal(whole.view, cut.view)
+    np.testing.assert_array_equal(whole.query, cut.query)
+    np.testing.assert_allclose(whole.ranking, cut.ranking, atol=1e-6)
+    used = np.isfinite(np.asarray(whole.distance))
+    for name in ("points", "grid"):
+        of = lambda t, m, name=name: np.asarray(getattr(t.patches, name))[np.asarray(m.view)[:, None], m.template]
+        np.testing.assert_array_equal(of(templates, whole)[used], of(small, cut)[used])
+    one, other = select(whole, query, templates, config), select(cut, query, small, config)
+    np.testing.assert_allclose(one.weight, other.weight, atol=1e-6)
+
+
+def test_compact_leaves_full_templates_alone_and_refuses_others(templates):
+    full = eqx.tree_at(lambda t: t.patches.valid, templates, jnp.ones_like(templates.patches.valid))
+    assert compact(full, multiple=8) is full
+    none = compact(
+        eqx.tree_at(lambda t: t.patches.valid, templates, jnp.zeros_like(templates.patches.valid)), multiple=8
+    )
+    assert none.patches.valid.shape == (8, 8) and not np.any(none.patches.valid)
+    with pytest.raises(ValueError, match="positive multiple"):
+        compact(templates, multiple=0)
+
+
+def test_the_shortlist_needs_no_copy_of_the_templates():
+    """Half-precision features of 200 templates are pooled one template at a time; the list's are copied."""
+    views, patches, channels, listed = 200, 256, 384, 20
+    shapes = jax.eval_shape(lambda: problems.blank_templates(views, patches, channels))
+    query = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), shapes.patches)
+    query = eqx.tree_at(lambda q: q.features, query, jax.ShapeDtypeStruct((patches, channels), jnp.float32))
+    run = jax.jit(lambda q, t: match(q, t, MatchConfig(shortlist=listed)))
+    memory = run.lower(query, shapes).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < listed * patches * channels * 2 + 16 * 2**20
+    assert memory.temp_size_in_bytes < views * patches * channels * 2 / 2

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 
 from ipjax.config import RefineConfig
 from ipjax.features import lift
-from ipjax.refinement import Cloud, nearest_inside, refine, retract, rotation_from_vector, solve_positive
+from ipjax.refinement import (
+    Cloud,
+    _nearest_visible,
+    nearest_inside,
+    refine,
+    retract,
+    rotation_from_vector,
+    solve_positive,
+)
 from ipjax.types import Camera
 
 CONFIG = RefineConfig(steps=15, points=256)
@@ -136,3 +144,17 @@ def test_rotations_are_rotations(seed, power):
     np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=2e-6)
     np.testing.assert_allclose(matrix @ np.asarray(vector), vector, atol=1e-5)
     assert bool(jnp.all(jnp.isfinite(jax.jacfwd(rotation_from_vector)(vector))))
+
+
+NEAREST = jax.jit(_nearest_visible)
+
+
+@given(seed=st.integers(0, 2**31), share=st.sampled_from([0.0, 0.3, 1.0]))
+def test_the_nearest_visible_point_is_the_first_of_the_nearest(seed, share):
+    rng = np.random.default_rng(seed)
+    # Small integers: distances are exact, and ties abound.
+    targets, placed = (jnp.asarray(rng.integers(-2, 3, (n, 3)), jnp.float32) for n in (30, 21))
+    visible = rng.random(21) < share
+    squared = np.sum((np.asarray(targets)[:, None] - np.asarray(placed)) ** 2, axis=-1)
+    expected = np.where(visible, squared, np.inf).argmin(axis=1)
+    np.testing.assert_array_equal(NEAREST(targets, placed, jnp.asarray(visible)), expected)

@@ -12,7 +12,7 @@ import numpy as np
 from ipjax.config import Config
 from ipjax.features import describe
 from ipjax.host.frames import frame_turned
-from ipjax.host.objects import ObjectInfo
+from ipjax.host.objects import ObjectInfo, compact
 from ipjax.pipeline import estimate
 from ipjax.types import PoseEstimate, Query, Similarity, Templates
 
@@ -51,6 +51,7 @@ class Estimator:
         self.config = config
         self.options: dict[str, Any] = {"crop": "square"} | options
         self._compiled: dict[Any, Any] = {}
+        self._compact: set[int] = set()
 
     def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
         """The crop of one object, without looking at it yet: bad input is refused here.
@@ -72,6 +73,10 @@ class Estimator:
             seed: same seed, same answer.
             diameter: the object's true diameter in metres, where it is known.
         """
+        if index not in self._compact:
+            templates, info = self.objects[index]
+            self.objects[index] = compact(templates), info
+            self._compact.add(index)
         templates, info = self.objects[index]
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)

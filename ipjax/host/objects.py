@@ -24,6 +24,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -295,6 +296,34 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         Path(temporary).unlink(missing_ok=True)
         raise
     return path
+
+
+def compact(templates: Templates, *, multiple: int = 32) -> Templates:
+    """Templates with fewer patches each, and the same answers: most of an image is background.
+
+    The valid patches come first, in their old order, then as many others as make all templates alike: a multiple of
+    ``multiple``. At least one of the others stays, the last of the grid unless that is valid, so that ``grid`` still
+    tells how large it is. To be done once, before ``estimate``; an object file keeps every patch.
+
+    Raises:
+        ValueError: the templates are no single object's, or ``multiple`` is not positive.
+    """
+    valid = np.asarray(templates.patches.valid)
+    if valid.ndim != 2 or multiple < 1:
+        raise ValueError(f"compact takes one object's templates and a positive multiple, not {valid.shape}, {multiple}")
+    views, patches = valid.shape
+    count = multiple * (int(valid.sum(axis=1).max()) // multiple + 1)
+    if count >= patches:
+        return templates
+    place = np.where(valid, np.arange(patches), 2 * patches - np.arange(patches))
+    chosen = np.argsort(place, axis=1)[:, :count]
+    take = lambda x: jnp.asarray(np.asarray(x)[np.arange(views)[:, None], chosen])
+    return dataclasses.replace(
+        templates,
+        patches=jax.tree.map(take, templates.patches),
+        norm=take(templates.norm),
+        seen=take(templates.seen),
+    )
 
 
 def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:

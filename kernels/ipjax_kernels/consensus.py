@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ipjax_kernels.similarity import fit_batch_last
 
+_TOGETHER = 8  # pairs that are judged in one step on a CPU: more are not faster and take longer to compile
+
 
 class Hypotheses(NamedTuple):
     """Similarities (``target = scale * rotation @ source + translation``) with their support, best first."""
@@ -102,6 +104,56 @@ def score_sets(
     return truncated, inside, jnp.sum(weight * squared, axis=-1)
 
 
+def score_batch_last(
+    rotation: Float[Array, "3 3 h"],
+    translation: Float[Array, "3 h"],
+    scale: Float[Array, "h"],
+    source: Float[Array, "k 3"],
+    target: Float[Array, "k 3"],
+    weight: Float[Array, "k"],
+    threshold: Float[Array, "h"],
+) -> tuple[Float[Array, "h"], Float[Array, "h"], Float[Array, "h"]]:
+    """``score_sets`` of the residuals of thousands of hypotheses, which are never in memory; the batch axis last."""
+
+    def by_pairs(rotation, translation, scale, source, target, weight, threshold):
+        # A CPU sums along the last axis one number at a time. Here a few pairs at a time are added to the sums of
+        # all hypotheses, which vectorises and stays in the cache; a score that nobody reads costs nothing.
+        total = jnp.sum(weight)
+        share = weight / jnp.where(total > 0, total, 1)
+        limit = jnp.square(threshold)
+        inverse = 1 / jnp.where(limit > 0, limit, 1)
+        scaled = jax.lax.optimization_barrier(scale * rotation)
+        padding = -weight.shape[0] % _TOGETHER
+        parts = [
+            jnp.pad(x, ((0, padding), *[(0, 0)] * (x.ndim - 1))).reshape(-1, _TOGETHER, *x.shape[1:])
+            for x in (source, target, weight, share)
+        ]
+
+        def add(sums, part):
+            truncated, inside, loss = sums
+            for point, image, weight, share in zip(*part, strict=True):
+                squared = jnp.zeros((), source.dtype)
+                for row in range(3):
+                    moved = sum(scaled[row, column] * point[column] for column in range(3))
+                    squared = squared + (moved + (translation[row] - image[row])) ** 2
+                truncated = truncated + share * jnp.maximum(0, 1 - squared * inverse)
+                inside = inside + jnp.where(squared < limit, weight, 0)
+                loss = loss + weight * squared
+            return (truncated, inside, loss), None
+
+        start = (jnp.zeros_like(scale),) * 3
+        (truncated, inside, loss), _ = jax.lax.scan(add, start, parts)
+        inside = inside / jnp.where(total > 0, total, 1)
+        return jnp.where(limit > 0, jnp.minimum(truncated, 1), 0), inside, loss
+
+    def at_once(rotation, translation, scale, source, target, weight, threshold):
+        rotation, translation = jnp.moveaxis(rotation, -1, 0), jnp.moveaxis(translation, -1, 0)
+        return score_sets(residuals(rotation, translation, scale, source, target), weight, threshold)
+
+    arguments = rotation, translation, scale, source, target, weight, threshold
+    return jax.lax.platform_dependent(*arguments, cpu=by_pairs, default=at_once)
+
+
 @partial(jax.jit, static_argnames=("count", "size", "keep", "refits", "rank", "relative"))
 def consensus(
     key: Key[Array, ""],
@@ -158,29 +210,38 @@ def consensus(
     lower, upper = (jnp.asarray(bound, source.dtype) for bound in scale_bounds)
     threshold = jnp.asarray(threshold, source.dtype)
 
-    def judge(rotation, translation, scale, allowed):
-        squared = residuals(rotation, translation, scale, source, target)
-        limit = threshold * scale if relative else jnp.broadcast_to(threshold, scale.shape)
-        truncated, inside, loss = score_sets(squared, weight, limit)
+    def rate(scores, scale, limit, allowed):
+        truncated, inside, loss = scores
         allowed = allowed & (scale >= lower) & (scale <= upper)
         first = truncated if rank == "msac" else inside
         second = jnp.zeros_like(loss) if rank == "msac" else loss
         return jnp.where(allowed, first, -1), jnp.where(allowed, second, jnp.inf), limit, allowed
 
+    def limit_of(scale):
+        return threshold * scale if relative else jnp.broadcast_to(threshold, scale.shape)
+
+    def judge(rotation, translation, scale, allowed):
+        limit = limit_of(scale)
+        squared = residuals(rotation, translation, scale, source, target)
+        return rate(score_sets(squared, weight, limit), scale, limit, allowed)
+
     with jax.named_scope("fit"):
         chosen_source = jnp.moveaxis(source.T[:, table.T], 0, 1)  # (m, 3, n): the batch axis last
         chosen_target = jnp.moveaxis(target.T[:, table.T], 0, 1)
+        chosen_source, chosen_target = jax.lax.optimization_barrier((chosen_source, chosen_target))
         ones = jnp.ones(table.T.shape, source.dtype)
         rotation, translation, scale, spread_found, success = fit_batch_last(chosen_source, chosen_target, ones)
         success = success & (spread_found >= spread) & jnp.all(weight[table] > 0, axis=1)
         success = success & _edges_agree(chosen_source, chosen_target, edge_ratio)
-        rotation, translation = jnp.moveaxis(rotation, -1, 0), jnp.moveaxis(translation, -1, 0)
         rotation, translation, scale, success = jax.lax.optimization_barrier((rotation, translation, scale, success))
     with jax.named_scope("judge"):
-        score, loss, _, success = judge(rotation, translation, scale, success)
+        limit = limit_of(scale)
+        scores = score_batch_last(rotation, translation, scale, source, target, weight, limit)
+        score, loss, _, success = rate(scores, scale, limit, success)
         # A full sort costs six times as much; only "count" needs its second key.
         order = jax.lax.top_k(score, keep)[1] if rank == "msac" else _order(score, loss)[:keep]
-        best = (rotation[order], translation[order], scale[order], score[order], loss[order], success[order])
+        rotation, translation = jnp.moveaxis(rotation[..., order], -1, 0), jnp.moveaxis(translation[..., order], -1, 0)
+        best = (rotation, translation, scale[order], score[order], loss[order], success[order])
 
     def refit(_, best):
         rotation, translation, scale, score, loss, success = best

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+_SHARES = (0.375, 0.5, 0.625, 0.75)  # of the query's patches: what its valid ones are cut to, if they fit
+_LEAST = 64  # patches; fewer are not worth the branches
 NO_MATCH = -2.0  # the similarity of a patch that has no neighbour: finite, and below every cosine
 
 
@@ -23,7 +25,7 @@ class Neighbours(NamedTuple):
     template_similarity: Float[Array, "*b v q"]
 
 
-@partial(jax.jit, static_argnames=("memory_bytes", "dtype", "implementation"))
+@partial(jax.jit, static_argnames=("memory_bytes", "dtype", "implementation", "compact"))
 def nearest(
     query: Float[Array, "p c"],
     templates: Float[Array, "v q c"],
@@ -33,6 +35,7 @@ def nearest(
     memory_bytes: int = 64 * 2**20,
     dtype: Literal["float32", "bfloat16"] = "float32",
     implementation: Literal["xla", "pallas"] = "xla",
+    compact: bool = True,
 ) -> Neighbours:
     """For each query patch the most similar patch of every template, and the other way round.
 
@@ -44,7 +47,9 @@ def nearest(
     fit, and a template that does not fit is taken in parts. Under ``vmap`` the queries follow one another
     and share that memory. ``dtype`` is what the features are rounded to before the product, template by template;
     sums are float32 always. ``implementation``: "xla" runs anywhere and can be exported; "pallas" is one fused kernel
-    on CUDA devices, which keeps similarities out of memory altogether, and "xla" elsewhere.
+    on CUDA devices, which keeps similarities out of memory altogether, and "xla" elsewhere. ``compact`` ("xla" only)
+    multiplies the valid patches of the query and few others: one of five sizes, chosen at run time, so nothing is
+    ever left out. The templates' invalid patches are the caller's to leave out, once.
 
     No derivative flows through the similarities; take the cosine of the matched features for one.
 
@@ -65,7 +70,7 @@ def nearest(
     if 0 in query.shape or 0 in templates.shape:
         raise ValueError(f"nearest needs at least one patch and one template; got {query.shape} and {templates.shape}")
     query, templates = jax.lax.stop_gradient((query, templates))
-    blocks = partial(_search_blocks, memory_bytes=memory_bytes, dtype=jnp.dtype(dtype))
+    blocks = partial(_search_blocks, memory_bytes=memory_bytes, dtype=jnp.dtype(dtype), compact=compact)
     with jax.named_scope("nearest"):
         if implementation == "pallas":
             from ipjax_kernels.neighbours_pallas import search  # Pallas is a heavy import that few need
@@ -117,34 +122,58 @@ def _blank_missing(found, query_valid, template_valid):
     )
 
 
-def _search_blocks(query, templates, query_valid, template_valid, *, memory_bytes, dtype):
-    views, others, _ = templates.shape
+def _search_blocks(query, templates, query_valid, template_valid, *, memory_bytes, dtype, compact):
     row_bytes = 2 * 4 * query.shape[0]  # the similarities, and room for their masked copy
     if row_bytes > memory_bytes:
         raise ValueError(f"nearest needs memory_bytes >= {row_bytes} for {query.shape[0]} patches; got {memory_bytes}")
-    rows = min(others, memory_bytes // row_bytes)
-    together = min(views, memory_bytes // (row_bytes * others))
-
-    def search_singly(query, templates, query_valid, template_valid):
-        step = partial(_search_template, query, query_valid, rows=rows)
-        return jax.lax.map(lambda template: step(*template), (templates, template_valid))
-
-    def search_together(query, templates, query_valid, template_valid):
-        step = partial(_search_template, query, query_valid, rows=rows)
-        return jax.lax.map(lambda template: step(*template), (templates, template_valid), batch_size=together)
 
     @jax.custom_batching.sequential_vmap
     def search(query, templates, query_valid, template_valid):
         if templates.dtype == jnp.bfloat16:
             # As plain bits: the CPU compiler would widen all templates at once, before the loop.
             templates = jax.lax.bitcast_convert_type(templates, jnp.uint16)
-        arguments = query.astype(dtype), templates, query_valid, template_valid
-        if together < 2:
-            return tuple(search_singly(*arguments))
-        # One template's similarities stay in a CPU's cache; an accelerator wants more work at a time.
-        return tuple(jax.lax.platform_dependent(*arguments, cpu=search_singly, default=search_together))
+        patches = query.shape[0]
+        arguments = query.astype(dtype), query_valid, templates, template_valid
+        if not compact or patches < _LEAST:
+            return _search_all(*arguments, memory_bytes=memory_bytes)
+        sizes = sorted({min(patches, 16 * math.ceil(share * patches / 16)) for share in (*_SHARES, 1.0)})
+        count = jnp.sum(query_valid, dtype=jnp.int32)
+        choice = jnp.sum(jnp.asarray(sizes[:-1], jnp.int32) < count, dtype=jnp.int32)
+        branches = [partial(_search_first, size=size, memory_bytes=memory_bytes) for size in sizes]
+        return jax.lax.switch(choice, branches, *arguments)
 
     return search(query, templates, query_valid, template_valid)
+
+
+def _search_first(query, query_valid, templates, template_valid, *, size, memory_bytes):
+    """Search for ``size`` patches of the query, all valid ones among them, and number the results as if for all."""
+    patches = query.shape[0]
+    if size == patches:
+        return _search_all(query, query_valid, templates, template_valid, memory_bytes=memory_bytes)
+    index = jnp.arange(patches, dtype=jnp.int32)
+    # Valid ones first, each kind in its old order, so that ties still go to the lowest index.
+    chosen = jax.lax.sort((~query_valid, index), num_keys=1, is_stable=True)[1][:size]
+    found = _search_all(query[chosen], query_valid[chosen], templates, template_valid, memory_bytes=memory_bytes)
+    place = jnp.clip(jnp.cumsum(query_valid, dtype=jnp.int32) - 1, 0, size - 1)
+    forth, similarity, back, back_similarity = found
+    return forth[:, place], similarity[:, place], chosen[back], back_similarity
+
+
+def _search_all(query, query_valid, templates, template_valid, *, memory_bytes):
+    views, others, _ = templates.shape
+    row_bytes = 2 * 4 * query.shape[0]
+    rows = min(others, memory_bytes // row_bytes)
+    together = min(views, memory_bytes // (row_bytes * others))
+    step = partial(_search_template, query, query_valid, rows=rows)
+
+    def search(templates, template_valid, batch_size=None):
+        return tuple(jax.lax.map(lambda template: step(*template), (templates, template_valid), batch_size=batch_size))
+
+    if together < 2:
+        return search(templates, template_valid)
+    # One template's similarities stay in a CPU's cache; an accelerator wants more work at a time.
+    together = partial(search, batch_size=together)
+    return tuple(jax.lax.platform_dependent(templates, template_valid, cpu=search, default=together))
 
 
 def _search_template(query, query_valid, template, template_valid, *, rows):

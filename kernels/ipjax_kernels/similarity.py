@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float
 
 # Rounding may turn the rotation by at most about 1 / _MARGIN radians before ``success`` denies it.
 _MARGIN = 128.0
+# Up to so many points are summed one by one.
+_FEW = 8
 
 
 @partial(jax.jit, static_argnames="with_scale")
@@ -77,22 +79,34 @@ def fit_batch_last(
     0 for collinear points.
     """
     eps = jnp.finfo(source.dtype).eps
-    total = jnp.sum(weight, axis=0)
+    total = _sum(weight)
     share = weight / jnp.where(total > 0, total, 1)
-    source_mean = jnp.sum(share[:, None] * source, axis=0)
-    target_mean = jnp.sum(share[:, None] * target, axis=0)
+    # Vectors are tuples of three arrays from here on: element-wise throughout, which is what compilers are good at.
+    source_mean = tuple(_sum(share * source[:, axis]) for axis in range(3))
+    target_mean = tuple(_sum(share * target[:, axis]) for axis in range(3))
     # Centred before the product: a centroid a hundred units away would otherwise eat every digit of float32.
-    source_arm, target_arm = source - source_mean, target - target_mean
-    weighted_arm = share[:, None] * target_arm
-    covariance = jnp.sum(weighted_arm[:, :, None] * source_arm[:, None, :], axis=0)
-    variance = jnp.sum(share * jnp.sum(source_arm**2, axis=1), axis=0)
-    rotation, trace, singular = _polar(covariance)
+    source_arm = tuple(source[:, axis] - source_mean[axis] for axis in range(3))
+    target_arm = tuple(target[:, axis] - target_mean[axis] for axis in range(3))
+    # The barriers part what the CPU compiler would otherwise compute once for each of its readers.
+    share, source_arm, target_arm = _part((share, source_arm, target_arm))
+    if source.shape[0] <= _FEW:
+        covariance = jnp.stack([jnp.stack([_sum(share * t * s) for s in source_arm]) for t in target_arm])
+    else:
+        weighted_arm = jnp.stack([share * t for t in target_arm], axis=1)
+        covariance = jnp.sum(weighted_arm[:, :, None] * jnp.stack(source_arm, axis=1)[:, None, :], axis=0)
+    variance = _sum(share * _dot(source_arm, source_arm))
+    target_variance = _sum(share * _dot(target_arm, target_arm))
+    if source.shape[0] == 3:
+        rotation, trace, singular = _polar_of_triangles(covariance, share, source_arm, target_arm)
+    else:
+        rotation, trace, singular = _polar(covariance)
+    rotation, trace, singular, variance = _part((rotation, trace, singular, variance))
 
     # All rounding errors are relative to the distance from the frame's origin, not to the size of the set.
     source_size = jnp.sqrt(jax.lax.stop_gradient(variance))
-    target_size = jnp.sqrt(jnp.sum(share * jnp.sum(jax.lax.stop_gradient(target_arm) ** 2, axis=1), axis=0))
-    source_far = jnp.max(jnp.abs(jax.lax.stop_gradient(source_mean)), axis=0)
-    target_far = jnp.max(jnp.abs(jax.lax.stop_gradient(target_mean)), axis=0)
+    target_size = jnp.sqrt(jax.lax.stop_gradient(target_variance))
+    source_far = _reach(jax.lax.stop_gradient(source_mean))
+    target_far = _reach(jax.lax.stop_gradient(target_mean))
     apart = (source_size > 8 * eps * source_far) & (target_size > 8 * eps * target_far)
     noise = _MARGIN * eps * (1 + _ratio(source_far, source_size) + _ratio(target_far, target_size))
     pinned = singular[1] + singular[2]
@@ -104,7 +118,9 @@ def fit_batch_last(
         scale = jnp.where(spread_out, trace / jnp.where(spread_out, variance, 1), 1)
     else:
         scale = jnp.ones_like(trace)
-    translation = target_mean - scale * jnp.sum(rotation * source_mean, axis=1)
+    translation = jnp.stack(
+        [mean - scale * _dot(row, source_mean) for mean, row in zip(target_mean, rotation, strict=True)]
+    )
     return rotation, translation, scale, spread, success
 
 
@@ -127,10 +143,74 @@ def _polar(matrix: Float[Array, "3 3 m"]) -> tuple[Float[Array, "3 3 m"], Float[
 
 @_polar.defjvp
 def _polar_jvp(primals, tangents):
+    found = _polar(*primals)
+    return found, _differentiate(found, primals[0], tangents[0])
+
+
+@jax.custom_jvp
+def _polar_of_triangles(matrix, share, source, target):
+    """``_polar`` of the covariance of three points, in closed form; corners (of weight 0: anywhere) about their mean.
+
+    Three points lie in a plane. Between two planes a rotation by an angle remains, once with and once without turning
+    over, and the larger of the two traces wins: their sum and difference are the singular values.
+    """
+    del matrix  # only derivatives go through it
+    there = share > 0
+    corners = [[tuple(jnp.where(there[i], x[i], 0) for x in arm) for i in range(3)] for arm in (source, target)]
+    (before, after) = _part(tuple(_span(list(corner)) for corner in corners))
+    flat = [
+        [(_dot(e1, arm), _dot(e2, arm)) for arm in corner]
+        for (e1, e2), corner in zip((before, after), corners, strict=True)
+    ]
+    xx, xy, yx, yy = (
+        _dot(share, [flat[1][i][row] * flat[0][i][column] for i in range(3)]) for row in (0, 1) for column in (0, 1)
+    )
+    straight, over = (xx + yy, yx - xy), (xx - yy, yx + xy)
+    straight, over = _part((straight, over))
+    straight_trace, over_trace = (jnp.sqrt(c * c + s * s) for c, s in (straight, over))
+    turned = over_trace > straight_trace
+    trace = jnp.where(turned, over_trace, straight_trace)
+    known = trace > 0
+    cosine = jnp.where(known, jnp.where(turned, over[0], straight[0]) / jnp.where(known, trace, 1), 1)
+    sine = jnp.where(known, jnp.where(turned, over[1], straight[1]) / jnp.where(known, trace, 1), 0)
+    sign = jnp.where(turned, -1, 1).astype(trace.dtype)
+    cosine, sine, sign = _part((cosine, sine, sign))
+    image_1 = tuple(cosine * a + sine * b for a, b in zip(*after, strict=True))
+    image_2 = tuple(sign * (cosine * b - sine * a) for a, b in zip(*after, strict=True))
+    image_1, image_2 = _part((image_1, image_2))
+    rotation = _combine((image_1, image_2, _cross(image_1, image_2)), (*before, _cross(*before)))
+    first, second = 0.5 * (straight_trace + over_trace), 0.5 * jnp.abs(straight_trace - over_trace)
+    return rotation, trace, jnp.stack([first, second, jnp.zeros_like(first)])
+
+
+@_polar_of_triangles.defjvp
+def _polar_of_triangles_jvp(primals, tangents):
+    found = _polar_of_triangles(*primals)
+    return found, _differentiate(found, primals[0], tangents[0])
+
+
+def _span(corners):
+    """Two orthonormal vectors that span what three vectors of sum zero span, or more if they are collinear."""
+    squares = [_dot(corner, corner) for corner in corners]
+    for i, j in ((0, 1), (0, 2)):  # the longest first
+        swap = squares[j] > squares[i]
+        corners[i], corners[j] = _choose(swap, corners[j], corners[i]), _choose(swap, corners[i], corners[j])
+        squares[i], squares[j] = jnp.where(swap, squares[j], squares[i]), jnp.where(swap, squares[i], squares[j])
+    zero = jnp.zeros_like(squares[0])
+    first = _choose(squares[0] > 0, _normalise(corners[0]), (zero + 1, zero, zero))
+    one, other = (_reject(corner, first) for corner in corners[1:])
+    second = _choose(_dot(other, other) > _dot(one, one), other, one)
+    second = _reject(_normalise(_reject(second, first)), first)  # twice is enough, also of nearly parallel vectors
+    x, y, z = (jnp.abs(component) for component in first)
+    least = jnp.where((x <= y) & (x <= z), 0, jnp.where(y <= z, 1, 2))
+    across = _reject(tuple((least == axis).astype(zero.dtype) for axis in range(3)), first)
+    return first, _normalise(_choose(_dot(second, second) > 0.25, second, across))
+
+
+def _differentiate(found, matrix, change):
     # M = R P with P symmetric; R' = R [w]× with (tr(P) I - P) w = vee(Rᵀ M' - M'ᵀ R). The matrix on the left has the
     # eigenvalues p_i + p_j: repeated singular values do no harm, only an undetermined rotation does.
-    (matrix,), (change,) = primals, tangents
-    rotation, trace, singular = _polar(matrix)
+    rotation, _, singular = found
     scale = jnp.where(singular[0] > 0, singular[0], 1)
     symmetric = jnp.sum(rotation[:, :, None] * (matrix / scale)[:, None, :], axis=0)
     symmetric = 0.5 * (symmetric + jnp.swapaxes(symmetric, 0, 1))
@@ -138,7 +218,7 @@ def _polar_jvp(primals, tangents):
     vee = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     trace_part = symmetric[0, 0] + symmetric[1, 1] + symmetric[2, 2]
     system = trace_part * jnp.eye(3, dtype=matrix.dtype)[:, :, None] - symmetric
-    adjugate = jnp.stack([_cross(system[1], system[2]), _cross(system[2], system[0]), _cross(system[0], system[1])])
+    adjugate = jnp.stack([jnp.stack(_cross(system[i], system[j])) for i, j in ((1, 2), (2, 0), (0, 1))])
     determinant = jnp.sum(system[0] * adjugate[0], axis=0)
     known = determinant > _MARGIN * jnp.finfo(matrix.dtype).eps
     solution = jnp.sum(adjugate * vee[:, None], axis=0) / jnp.where(known, determinant, 1)
@@ -153,7 +233,7 @@ def _polar_jvp(primals, tangents):
         axis=1,
     )
     trace_change = jnp.sum(rotation * change, axis=(0, 1))
-    return (rotation, trace, singular), (rotation_change, trace_change, jnp.zeros_like(singular))
+    return rotation_change, trace_change, jnp.zeros_like(singular)
 
 
 @jax.custom_batching.custom_vmap
@@ -161,52 +241,52 @@ def _decompose(matrix: Float[Array, "3 3 m"]) -> tuple[Float[Array, "3 3 m"], Fl
     """Nearest proper rotations and signed singular values of matrices whose largest entry is 1 or 0."""
     iterations = 12 if jnp.finfo(matrix.dtype).bits <= 32 else 18  # three pairs a sweep
     tiny = jnp.finfo(matrix.dtype).tiny
-    identity = jnp.broadcast_to(jnp.eye(3, dtype=matrix.dtype)[:, :, None], matrix.shape)
+    zero = jnp.zeros_like(matrix[0, 0])
+    identity = tuple(tuple(zero + float(row == column) for row in range(3)) for column in range(3))
 
     def rotate(_, state):
         # One pair of columns a step, then the columns move up by one: three different pairs in three steps. All
         # three unrolled in one step would be duplicated many times over by the fusion pass of the CPU compiler.
         (a, b, c), (u, v, w) = state
-        gap = jnp.sum(b * b, axis=0) - jnp.sum(a * a, axis=0)
-        twice = 2 * jnp.sum(a * b, axis=0)
+        gap = _dot(b, b) - _dot(a, a)
+        twice = 2 * _dot(a, b)
         reach = jnp.abs(gap) + jnp.sqrt(gap * gap + twice * twice)
         tangent = jnp.where(gap < 0, -twice, twice) / jnp.maximum(reach, tiny)
         cosine = jax.lax.rsqrt(1 + tangent * tangent)
         sine = cosine * tangent
-        return (sine * a + cosine * b, c, cosine * a - sine * b), (sine * u + cosine * v, w, cosine * u - sine * v)
+        turn = lambda p, q: tuple(sine * x + cosine * y for x, y in zip(p, q, strict=True))
+        back = lambda p, q: tuple(cosine * x - sine * y for x, y in zip(p, q, strict=True))
+        return (turn(a, b), c, back(a, b)), (turn(u, v), w, back(u, v))
 
-    start = tuple(matrix[:, i] for i in range(3)), tuple(identity[:, i] for i in range(3))
-    columns, basis = jax.lax.fori_loop(0, iterations, rotate, start)
-    norms = [jnp.sum(column * column, axis=0) for column in columns]
-    basis = list(basis)
+    start = tuple(tuple(matrix[row, column] for row in range(3)) for column in range(3))
+    columns, basis = _part(jax.lax.fori_loop(0, iterations, rotate, (start, identity)))
+    norms, basis = [_dot(column, column) for column in columns], list(basis)
     for i, j in ((0, 1), (1, 2), (0, 1)):
         swap = norms[j] > norms[i]
         norms[i], norms[j] = jnp.where(swap, norms[j], norms[i]), jnp.where(swap, norms[i], norms[j])
-        basis[i], basis[j] = jnp.where(swap, basis[j], basis[i]), jnp.where(swap, basis[i], basis[j])
+        basis[i], basis[j] = _choose(swap, basis[j], basis[i]), _choose(swap, basis[i], basis[j])
 
     right_1 = _normalise(basis[0])
-    right_2 = _normalise(basis[1] - right_1 * jnp.sum(right_1 * basis[1], axis=0))
+    right_2 = _normalise(_reject(basis[1], right_1))
+    right_1, right_2 = _part((right_1, right_2))
     right_3 = _cross(right_1, right_2)
-    image_1, image_2, image_3 = (jnp.sum(matrix * right, axis=1) for right in (right_1, right_2, right_3))
-    norm_1 = jnp.sqrt(jnp.sum(image_1 * image_1, axis=0))
-    left_1 = jnp.where(norm_1 > 0, image_1 / jnp.where(norm_1 > 0, norm_1, 1), right_1)
-    image_2 = image_2 - left_1 * jnp.sum(left_1 * image_2, axis=0)
-    norm_2 = jnp.sqrt(jnp.sum(image_2 * image_2, axis=0))
+    image_1, image_2, image_3 = (tuple(_dot(row, right) for row in matrix) for right in (right_1, right_2, right_3))
+    norm_1 = jnp.sqrt(_dot(image_1, image_1))
+    left_1 = _choose(norm_1 > 0, tuple(x / jnp.where(norm_1 > 0, norm_1, 1) for x in image_1), right_1)
+    image_2 = _reject(image_2, left_1)
+    norm_2 = jnp.sqrt(_dot(image_2, image_2))
     known = norm_2 > jnp.finfo(matrix.dtype).eps * 0.5
+    left_1, image_2, norm_2, known = _part((left_1, image_2, norm_2, known))
     # Rank one or none: any direction across the first will do; for the zero matrix it is the identity's own.
-    across = right_2 - left_1 * jnp.sum(left_1 * right_2, axis=0)
-    other = right_3 - left_1 * jnp.sum(left_1 * right_3, axis=0)
-    across = jnp.where(jnp.sum(across * across, axis=0) > 0.25, across, other)
-    across = jnp.where(jnp.sum(across * across, axis=0) > 0.25, across, right_1)
-    left_2 = _normalise(jnp.where(known, image_2, across))
-    left_2 = _normalise(left_2 - left_1 * jnp.sum(left_1 * left_2, axis=0))
+    across, other = _reject(right_2, left_1), _reject(right_3, left_1)
+    across = _choose(_dot(across, across) > 0.25, across, other)
+    across = _choose(_dot(across, across) > 0.25, across, right_1)
+    left_2 = _normalise(_choose(known, image_2, across))
+    left_2 = _part(_normalise(_reject(left_2, left_1)))
     left_3 = _cross(left_1, left_2)
-    rotation = (
-        left_1[:, None] * right_1[None, :] + left_2[:, None] * right_2[None, :] + left_3[:, None] * right_3[None, :]
-    )
+    rotation = _combine((left_1, left_2, left_3), (right_1, right_2, right_3))
     # The third values' sign is what a mirror image leaves: this is tr(S·D) term by term.
-    singular = jnp.stack([norm_1, jnp.where(known, norm_2, 0), jnp.sum(left_3 * image_3, axis=0)])
-    return rotation, singular
+    return rotation, jnp.stack([norm_1, jnp.where(known, norm_2, 0), _dot(left_3, image_3)])
 
 
 @_decompose.def_vmap
@@ -220,10 +300,50 @@ def _decompose_vmap(size, batched, matrix):
     return (rotation, singular), (True, True)
 
 
-def _normalise(vector):
-    square = jnp.sum(vector * vector, axis=0)
-    return vector * jnp.where(square > 0, jax.lax.rsqrt(jnp.where(square > 0, square, 1)), 0)
+def _sum(values):
+    """Over the first axis; of a few values one after the other, because a short reduction does not vectorise."""
+    return sum(values[1:], values[0]) if values.shape[0] <= _FEW else jnp.sum(values, axis=0)
+
+
+def _part(values):
+    return jax.lax.optimization_barrier(values)
+
+
+# Vectors as tuples of three arrays.
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(a, b):
-    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _choose(condition, a, b):
+    return tuple(jnp.where(condition, x, y) for x, y in zip(a, b, strict=True))
+
+
+def _reject(vector, unit):
+    """What is left of a vector without its part along a unit vector."""
+    along = _dot(vector, unit)
+    return tuple(x - along * u for x, u in zip(vector, unit, strict=True))
+
+
+def _normalise(vector):
+    square = _dot(vector, vector)
+    inverse = jnp.where(square > 0, jax.lax.rsqrt(jnp.where(square > 0, square, 1)), 0)
+    return tuple(x * inverse for x in vector)
+
+
+def _reach(vector):
+    return jnp.maximum(jnp.maximum(jnp.abs(vector[0]), jnp.abs(vector[1])), jnp.abs(vector[2]))
+
+
+def _combine(left, right):
+    """The matrices Σ left · rightᵀ."""
+    left, right = _part((left, right))
+    entry = lambda row, column: sum(a[row] * b[column] for a, b in zip(left[1:], right[1:], strict=True))
+    return jnp.stack(
+        [jnp.stack([left[0][row] * right[0][column] + entry(row, column) for column in range(3)]) for row in range(3)]
+    )

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ipjax_kernels import reference
-from ipjax_kernels.consensus import consensus, draw_minimal_sets, residuals
+from ipjax_kernels.consensus import consensus, draw_minimal_sets, residuals, score_batch_last, score_sets
 from ipjax_kernels.similarity import umeyama
 from jaxtyping import config as jaxtyping_config
 
@@ -263,3 +263,32 @@ def test_refuses_wrong_shapes_in_words():
             draw_minimal_sets(jax.random.key(0), weight[:2], 5, 3)
     finally:
         jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@given(seed=st.integers(0, 2**31))
+def test_scores_are_the_same_by_pairs_and_at_once(seed):
+    """The CPU's sums, a few pairs at a time, against those of all residuals."""
+    rng = np.random.default_rng(seed)
+    source, target = (jnp.asarray(rng.normal(size=(PAIRS, 3)), jnp.float32) for _ in range(2))
+    rotation = jnp.asarray(rng.normal(size=(16, 3, 3)), jnp.float32)
+    translation, scale = (jnp.asarray(rng.normal(size=n), jnp.float32) for n in ((16, 3), (16,)))
+    weight = jnp.asarray(rng.random(PAIRS) * (rng.random(PAIRS) < 0.8), jnp.float32)
+    threshold = jnp.asarray(rng.uniform(0.5, 3, 16) * (rng.random(16) < 0.9), jnp.float32)
+    squared = residuals(rotation, translation, scale, source, target)
+    expected = score_sets(squared, weight, threshold)
+    found = BATCH_LAST(jnp.moveaxis(rotation, 0, -1), translation.T, scale, source, target, weight, threshold)
+    on_edge = np.any(np.abs(np.asarray(squared) - np.square(threshold)[:, None]) < 1e-5, axis=1)
+    for index, (mine, theirs) in enumerate(zip(found, expected, strict=True)):
+        compared = ~on_edge if index == 1 else np.ones(16, bool)
+        np.testing.assert_allclose(np.asarray(mine)[compared], np.asarray(theirs)[compared], rtol=2e-5, atol=2e-6)
+
+
+BATCH_LAST = jax.jit(score_batch_last)
+
+
+def test_residuals_are_never_in_memory():
+    """4096 hypotheses × 512 pairs would be 8 MiB of residuals; sets, fits and scores take a few numbers a set."""
+    shapes = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in ((512, 3), (512, 3), (512,))]
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    memory = consensus.lower(key, *shapes, 0.01, count=4096, keep=16).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 120 * 4 * 4096

@@ -227,3 +227,27 @@ def test_refuses_wrong_shapes_in_words(unchecked_shapes):
         nearest(query, templates, query_valid, template_valid, memory_bytes=10)
     with pytest.raises(ValueError, match="cycle_distance needs"):
         cycle_distance(jnp.zeros(4, int), jnp.zeros(5, int), jnp.zeros((3, 2)), jnp.ones(4, bool), jnp.ones(5, bool))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.45, 0.6, 0.7, 0.9, 1.0])
+def test_compaction_changes_nothing(share):
+    """Every size that valid patches are cut to, with ties: what the whole search finds, at the same indices."""
+    rng = np.random.default_rng(0)
+    patches = 100
+    query, templates = (rng.integers(-1, 2, (*n, CHANNELS)).astype(np.float32) for n in ((patches,), (3, 90)))
+    valid = np.zeros(patches, bool)
+    valid[rng.permutation(patches)[: round(share * patches)]] = True
+    arguments = [jnp.asarray(x) for x in (query, templates, valid, rng.random((3, 90)) < 0.7)]
+    expected = reference.nearest(*arguments)
+    for memory_bytes in (2**20, 2 * 4 * patches * 20):
+        for compact in (True, False):
+            assert_equal(nearest(*arguments, memory_bytes=memory_bytes, compact=compact), expected)
+
+
+def test_compaction_saves_products():
+    """Counted by the compiler: a search for half of the patches costs half."""
+    shapes = [jax.ShapeDtypeStruct(*x) for x in (((128, 64), jnp.float32), ((4, 128, 64), jnp.float32))]
+    flags = [jax.ShapeDtypeStruct(shape, bool) for shape in ((128,), (4, 128))]
+    text = nearest.lower(*shapes, *flags).as_text()
+    rows = {int(n) for n in re.findall(r"dot_general.*-> tensor<(\d+)x128xf32>", text)}
+    assert rows == {48, 64, 80, 96, 128}

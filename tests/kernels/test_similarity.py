@@ -207,3 +207,87 @@ def test_refuses_wrong_shapes_in_words():
                 umeyama(jnp.zeros(source), jnp.zeros(target), jnp.zeros(weight))
     finally:
         jaxtyping_config.update("jaxtyping_disable", False)
+
+
+TRIANGLES = 64
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    log_scale=st.floats(-3, 3),
+    kind=st.sampled_from(["exact", "any", "weights", "far", "thin", "mirrored", "one absent"]),
+)
+def test_triangles_equal_the_twin(seed, log_scale, kind):
+    """Sets of three have a form of their own: the same numbers, batched, wherever the rotation is determined."""
+    rng = np.random.default_rng(seed)
+    source = rng.normal(size=(TRIANGLES, 3, 3))
+    target = rng.normal(size=(TRIANGLES, 3, 3))
+    weight = np.ones((TRIANGLES, 3))
+    rotation = random_rotation(rng)
+    if kind == "thin":
+        source[:, 2] = 0.5 * (source[:, 0] + source[:, 1]) + 0.2 * source[:, 2]
+    if kind in ("exact", "far", "thin", "mirrored"):
+        target = (source * [1, 1, -1] if kind == "mirrored" else source) @ rotation.T
+    if kind == "weights":
+        weight = rng.uniform(0.1, 1, weight.shape)
+    elif kind == "one absent":
+        weight[:, 1] = 0
+        source[:, 1] = np.nan
+    target = 10**log_scale * (target + (20 if kind == "far" else 1))
+    source, target, weight = (x.astype(np.float32) for x in (source, target, weight))
+    found = [np.asarray(x) for x in umeyama(jnp.asarray(source), jnp.asarray(target), jnp.asarray(weight))]
+    np.testing.assert_allclose(found[0] @ np.swapaxes(found[0], 1, 2), np.tile(np.eye(3), (TRIANGLES, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(found[0]), 1, atol=1e-5)
+    assert all(np.isfinite(x).all() for x in found[:3])
+    if kind == "one absent":
+        assert not found[3].any()
+        return
+    checked = 0
+    for i in range(TRIANGLES):
+        twin = reference.umeyama(source[i], target[i], weight[i])
+        share = weight[i].astype(np.float64) / weight[i].sum()
+        arms = [x[i].astype(np.float64) - share @ x[i] for x in (source, target)]
+        values = np.linalg.svd((share[:, None] * arms[1]).T @ arms[0])[1]
+        # Rounding turns a rotation by eps times this much; the twin has double precision.
+        worth = values[0] / max(values[1], 1e-30) * (50 if kind == "far" else 1)
+        if worth > 500:
+            continue
+        checked += 1
+        assert found[3][i]
+        np.testing.assert_allclose(found[0][i], twin[0], atol=1e-6 * (10 + worth))
+        np.testing.assert_allclose(found[2][i], twin[2], rtol=1e-5 * (1 + worth / 10))
+    assert checked > TRIANGLES / 8
+
+
+@pytest.mark.parametrize("kind", ["coincident", "collinear", "two", "constant target"])
+def test_degenerate_triangles_are_finite_and_said(kind):
+    source = np.random.default_rng(1).normal(size=(3, 3)).astype(np.float32)
+    if kind == "coincident":
+        source[:] = source[0]
+    elif kind == "collinear":
+        source[2] = 2 * source[1] - source[0]
+    target = source * 2 + 1
+    if kind == "constant target":
+        target[:] = 3
+    weight = jnp.asarray([1.0, 1.0, 0.0 if kind == "two" else 1.0])
+    found = umeyama(jnp.asarray(source), jnp.asarray(target), weight)
+    assert not found[3]
+    assert all(np.all(np.isfinite(x)) for x in found[:3])
+    np.testing.assert_allclose(np.linalg.det(found[0]), 1, atol=1e-5)
+    if kind in ("collinear", "two"):  # the best of the rotations that are left
+        moved = found[2] * source[:2] @ np.asarray(found[0]).T + np.asarray(found[1])
+        np.testing.assert_allclose(moved, target[:2], atol=1e-4)
+    assert np.all(np.isfinite(GRADIENT(jnp.asarray(source), jnp.asarray(target), weight)))
+
+
+@pytest.mark.parametrize("shape", ["full", "equilateral", "mirrored"])
+def test_gradient_of_triangles_equals_differences(shape, x64):
+    rng = np.random.default_rng(3)
+    source = np.eye(3) if shape == "equilateral" else rng.normal(size=(3, 3))
+    image = source * [1, 1, -1] if shape == "mirrored" else source
+    target = jnp.asarray(image @ random_rotation(rng).T * 0.3 + 1)
+    direction, weight = rng.normal(size=source.shape), jnp.asarray([1.0, 0.5, 2.0])
+    slope = np.sum(np.asarray(GRADIENT(jnp.asarray(source), target, weight)) * direction)
+    step = 1e-6
+    ahead, behind = (total(jnp.asarray(source + sign * step * direction), target, weight) for sign in (1, -1))
+    np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-6, atol=1e-7)

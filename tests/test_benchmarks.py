@@ -1,0 +1,77 @@
+"""The benchmark commands: what they print is what was measured, and the table goes where it should."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+
+from benchmarks import table
+from benchmarks.measure import compile_fresh, summarise, time_in_turns
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = {
+    "device": "a device",
+    "platform": "cpu",
+    "cores": 2,
+    "jax": "0",
+    "python": "3",
+    "date": "2000-01-01",
+    "quick": False,
+    "rows": [
+        {
+            "name": "neighbours",
+            "implementation": "nearest (xla)",
+            "size": "1 × 2² × 3",
+            "dtype": "float32",
+            "ratio_to_product": 1.25,
+            "ratio_to_large_product": 0.5,
+            "temporary_bytes": 2**20,
+            **summarise([0.001, 0.002, 0.003]),
+        },
+        {"name": "estimate", "implementation": "batch", "size": "2", "dtype": "float32", "queries_per_s": 12.0},
+    ],
+}
+
+
+def test_a_table_replaces_what_stands_between_its_marks(tmp_path, monkeypatch):
+    results, page = tmp_path / "results.json", tmp_path / "page.md"
+    results.write_text(json.dumps(RESULTS))
+    page.write_text(f"before\n{table.BEGIN}\nold\n{table.END}\nafter\n")
+    for _ in range(2):  # again and again, with the same outcome
+        monkeypatch.setattr(sys, "argv", ["table", str(results), "--into", str(page)])
+        table.main()
+        text = page.read_text()
+        assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+        assert "2 ms" in text and "1.25 × product" in text and "12 queries/s" in text and "1 MiB" in text
+        assert text.count(table.BEGIN) == 1
+    page.write_text("no marks")
+    with pytest.raises(SystemExit):
+        table.main()
+    assert page.read_text() == "no marks"
+
+
+def test_the_readme_has_a_place_for_the_table():
+    text = (ROOT / "README.md").read_text()
+    assert text.count(table.BEGIN) == text.count(table.END) == 1
+
+
+def test_temporary_bytes_and_turns_are_real():
+    run, seconds, temporary = compile_fresh(lambda x: jnp.sum(jnp.sort(x)), jnp.zeros(10_000))
+    assert seconds > 0 and temporary >= 40_000
+    times = time_in_turns({"one": lambda: run(jnp.zeros(10_000)), "other": lambda: run(jnp.ones(10_000))}, repeats=4)
+    assert [len(x) for x in times.values()] == [4, 4] and min(map(min, times.values())) > 0
+
+
+def test_a_quick_run_writes_its_rows(tmp_path):
+    path = tmp_path / "rows.json"
+    command = [sys.executable, "-m", "benchmarks", "--quick", "--only", "umeyama", "--json", str(path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
+    results = json.loads(path.read_text())
+    assert {row["implementation"] for row in results["rows"]} == {"umeyama", "vmapped jnp.linalg.svd"}
+    for row in results["rows"]:
+        assert row["runs"] == 7 and 0 < row["fastest_ms"] <= row["median_ms"]
+        assert row["temporary_bytes"] >= 0 and row["compile_s"] > 0
+    assert "| umeyama |" in done.stdout and "s in all" in done.stdout
