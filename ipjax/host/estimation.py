@@ -14,7 +14,7 @@ from ipjax.features import describe
 from ipjax.host.frames import frame_turned
 from ipjax.host.objects import ObjectInfo
 from ipjax.pipeline import estimate
-from ipjax.types import PoseEstimate, Query, Similarity, Templates
+from ipjax.types import Patches, PoseEstimate, Query, Similarity, Templates
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +62,14 @@ class Estimator:
         return frame_turned(rgb, depth, mask, camera, box=box, **options)
 
     def run(
-        self, index: int, view: Any, camera_from_crop: Similarity, *, seed: int = 0, diameter: float | None = None
+        self,
+        index: int,
+        view: Any,
+        camera_from_crop: Similarity,
+        *,
+        seed: int = 0,
+        diameter: float | None = None,
+        patches: Patches | None = None,
     ) -> Result:
         """Estimate one object in its crop.
 
@@ -71,16 +78,18 @@ class Estimator:
             view, camera_from_crop: from `frame`.
             seed: same seed, same answer.
             diameter: the object's true diameter in metres, where it is known.
+            patches: of the view, where it has been described already.
         """
         templates, info = self.objects[index]
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)
         known = {} if diameter is None else {"diameter": jnp.asarray(diameter, jnp.float32)}
 
-        see = self._ready("describe", describe, seconds, self.encoder, view)
-        start = time.perf_counter()
-        patches = jax.block_until_ready(see(self.encoder, view))
-        seconds["describe"] = time.perf_counter() - start
+        if patches is None:
+            see = self._ready("describe", describe, seconds, self.encoder, view)
+            start = time.perf_counter()
+            patches = jax.block_until_ready(see(self.encoder, view))
+            seconds["describe"] = time.perf_counter() - start
 
         query = Query(patches=patches, view=view)
         find = self._ready("estimate", estimate, seconds, templates, query, key, self.config, **known)

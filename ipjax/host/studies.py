@@ -31,6 +31,9 @@ from ipjax.host.weights import cache_folder, hash_file
 
 log = logging.getLogger("ipjax")
 
+SHARED = 512  # descriptions kept for a second configuration; about 1.5 MB each
+OWN_MAP = "the degradation's own map"
+
 
 @dataclasses.dataclass(frozen=True)
 class Known:
@@ -187,7 +190,7 @@ def _onboard(
 
 
 def _kept_alignment(path: Path) -> Alignment | None:
-    return dataclasses.replace(read_alignment(path), source="the degradation's own map") if path.is_file() else None
+    return dataclasses.replace(read_alignment(path), source=OWN_MAP) if path.is_file() else None
 
 
 def _key(source: Path, encoder: Encoder, config: OnboardConfig, quality: int, seed: int) -> str:
@@ -203,6 +206,19 @@ def _key(source: Path, encoder: Encoder, config: OnboardConfig, quality: int, se
     if quality:
         parts += [quality, seed]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
+
+
+def hash_code() -> str:
+    """Twelve digits of the source that an estimate hangs on, so that results of another state are not continued."""
+    import ipjax_kernels
+
+    package, kernels = Path(__file__).parent.parent, Path(ipjax_kernels.__file__).parent
+    files = [p for p in package.glob("*.py") if p.stem not in ("cli", "metrics", "triposr", "__main__")]
+    files += [package / "host" / f"{name}.py" for name in ("estimation", "frames", "studies")]
+    digest = hashlib.sha256()
+    for path in [*sorted(files), *sorted(kernels.glob("*.py"))]:
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 class Finder:
@@ -235,8 +251,27 @@ class Finder:
         self.estimator = Estimator([], encoder, config, crop=crop)
         self.order: dict[int, int] = {}
         self.compile_seconds = 0.0  # not counted as time per image
+        self.shared_seconds = 0.0  # counted as if it had been spent here
+        self.described: dict[tuple[int, int, int, int], tuple[Any, Any, float]] | None = None
         self.refused: list[str] = []  # targets that could not be tried, and why
         self.results: dict[tuple[int, int, int], Result] = {}
+
+    def beside(self, config: Config) -> "Finder":
+        """The same with another configuration: objects are loaded once, and of each target's crop, which hangs on no
+        setting, the description is kept for the other (of the first few hundred)."""
+        other = Finder(
+            self.known,
+            self.encoder,
+            config,
+            crop=self.crop,
+            seed=self.seed,
+            known_size=self.known_size,
+            keep=self.keep,
+        )
+        if self.described is None:
+            self.described = {}
+        other.described, other.order, other.estimator.objects = self.described, self.order, self.estimator.objects
+        return other
 
     def settings(self) -> dict[str, Any]:
         """What the results depend on, as plain JSON; a resumed run must agree in it."""
@@ -246,6 +281,7 @@ class Finder:
             made[str(obj_id)] = {"mesh": info.mesh_sha256, "notes": list(info.notes), **_plain(info.config)}
         return {
             "version": __version__,
+            "code": hash_code(),
             "config": describe_config(self.estimator.config),
             "crop": self.crop,
             "seed": self.seed,
@@ -256,7 +292,7 @@ class Finder:
 
     def __call__(self, frame: Frame, targets: Sequence[Target]) -> list[Estimate]:
         found = []
-        for target in targets:
+        for number, target in enumerate(targets):
             if target.obj_id not in self.known:
                 continue
             where = f"scene {frame.scene_id}, image {frame.im_id}, object {target.obj_id}"
@@ -264,17 +300,26 @@ class Finder:
                 self.refused.append(f"{where}: no depth image")
                 continue
             index = self._index(target.obj_id)
+            key = (frame.scene_id, frame.im_id, target.obj_id, number)
+            crop, patches, seconds = (self.described or {}).get(key, (None, None, 0.0))
+            self.shared_seconds += seconds
+            start = time.perf_counter()
             try:
-                crop = self.estimator.frame(index, frame.rgb, frame.depth, target.mask, frame.camera)
+                if crop is None:
+                    crop = self.estimator.frame(index, frame.rgb, frame.depth, target.mask, frame.camera)
             except ValueError as error:  # nothing to be seen there: a miss
                 self.refused.append(f"{where}: {error}")
                 continue
+            seconds = time.perf_counter() - start
             info = self.estimator.objects[index][1]
             alignment = self.known[target.obj_id].alignment
             unit = info.metres_per_unit or MM if alignment is None else alignment.scale
             diameter = unit / info.mesh_scale if self.known_size else None
-            result = self.estimator.run(index, *crop, seed=self.seed, diameter=diameter)
+            result = self.estimator.run(index, *crop, seed=self.seed, diameter=diameter, patches=patches)
             self.compile_seconds += result.seconds.get("compile", 0.0)
+            if self.described is not None and patches is None and len(self.described) < SHARED:
+                seconds += result.seconds["describe"]
+                self.described[key] = crop, result.query.patches, seconds
             if self.keep:
                 self.results[frame.scene_id, frame.im_id, target.obj_id] = result
             if not bool(result.estimate.success):
