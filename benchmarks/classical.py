@@ -94,6 +94,8 @@ class Classical:
         self.open3d = import_open3d()
         self.bodies, self.options, self.seed = dict(bodies), settings, seed
         self.refused: list[str] = []
+        self.notes = ["the method was told each object's true size"]
+        self.open3d.utility.set_verbosity_level(self.open3d.utility.VerbosityLevel.Error)  # one warning per target
         self._models: dict[int, tuple[Any, Any, float]] = {}
 
     def settings(self) -> dict[str, Any]:
@@ -101,6 +103,7 @@ class Classical:
         return {
             "method": "FPFH, RANSAC, ICP, given the true scale",
             "open3d": self.open3d.__version__,
+            "code": hash_file(Path(__file__))[:12],
             "seed": self.seed,
             **dataclasses.asdict(self.options),
             "objects": {

@@ -1021,7 +1021,8 @@ def evaluate(
         objects: only these objects; None = all that are targets.
         estimator: ``(frame, targets) -> estimates`` for the targets of one image; an object may be left out. Seconds
             that it counts in an attribute ``compile_seconds`` are not part of the time per image; those in
-            ``shared_seconds`` (work that another estimator has done for it) are added to it.
+            ``shared_seconds`` (work that another estimator has done for it) are added to it; sentences in ``notes`` go
+            under the table.
         results_dir: gets ``results.jsonl`` (a line per finished image: the record that resuming trusts),
             ``METHOD_DATASET-SPLIT.csv``, ``score.json`` and ``score.txt``.
         settings: what the results depend on (configuration, weights, meshes), as plain JSON; a folder with results of
@@ -1090,7 +1091,7 @@ def evaluate(
         ordered = [pair for image in images for pair in journal.done[image].rows]
         write_results(results, [row for row, _ in ordered])
         failed = [f"scene {s}, image {i}: {journal.done[s, i].error}" for s, i in images if journal.done[s, i].error]
-        notes = _alignment_notes(alignments)
+        notes = [*getattr(estimator, "notes", ()), *_alignment_notes(alignments)]
         if failed:
             notes.append(f"{len(failed)} images failed and count as misses, the first: {failed[0]}")
         found_score = score(

@@ -118,7 +118,7 @@ def prepare(
             added. None: the user's cache, where a file is named after all that it was made of.
         objects: only these.
         quality: 0 = the models as they are; 1–4: degraded to this level (see `degradation`) and, with a ``folder``,
-            kept in its subfolder ``quality_LEVEL``.
+            kept in its subfolder ``quality_LEVEL``; those of ``meshes`` are kept in ``meshes``.
         seed: of the degradation.
         meshes: for some objects a mesh of one's own, a reconstruction perhaps; then ``alignments`` must have the file
             of its similarity to the model (for evaluation only).
@@ -146,7 +146,9 @@ def prepare(
         source = Path(meshes[obj_id]) if obj_id in meshes else dataset.model_path(obj_id, "models")
         alignment = read_alignment(alignments[obj_id]) if obj_id in alignments else None
         key = _key(source, encoder, config, quality, seed)
-        if folder is None:
+        if folder is not None and obj_id in meshes:  # the file with its number is of the model
+            path = folder / "meshes" / f"obj_{obj_id:06d}_{key}.ipjax"
+        elif folder is None:
             path = cache_folder().parent / "objects" / f"{source.stem}_{key}.ipjax"
         else:
             path = there.get(obj_id, folder / f"obj_{obj_id:06d}.ipjax")
@@ -250,6 +252,7 @@ class Finder:
         self.crop, self.seed, self.known_size, self.keep = crop, seed, known_size, keep
         self.estimator = Estimator([], encoder, config, crop=crop)
         self.order: dict[int, int] = {}
+        self.notes = ["the method was told each object's true size"] if known_size else []
         self.compile_seconds = 0.0  # not counted as time per image
         self.shared_seconds = 0.0  # counted as if it had been spent here
         self.described: dict[tuple[int, int, int, int], tuple[Any, Any, float]] | None = None
