@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import results_page
-from benchmarks.classical import INSTALL, Classical, read_bodies
+from benchmarks.classical import INSTALL, Classical, import_open3d, read_bodies
 from ipjax.cli import _use_cache
 from ipjax.host import studies
 from ipjax.host.bop import Dataset, DatasetError, write_atomically
@@ -30,8 +30,8 @@ QUALITIES = {0: "scans"} | {level: f"meshes degraded to level {level}" for level
 def has_open3d() -> bool:
     """Whether the classical baseline can run."""
     try:
-        import open3d  # noqa: F401
-    except ImportError:
+        import_open3d()
+    except SystemExit:
         return False
     return True
 

@@ -273,8 +273,9 @@ def bars(study: Study) -> str:
     return "".join(parts) + "</svg>"
 
 
-def pictures(study: Study, side: int = 320) -> list[tuple[str, str]]:
-    """Captions and data URLs of the best, median and worst targets (by MSSD): truth green, estimate red."""
+def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
+    """Captions and data URLs of the best, median and worst targets (by MSSD of what was found): outlines on the photo,
+    and the model at the estimate."""
     import cv2
 
     from ipjax.host.bop import MM, Dataset, read_results
@@ -291,29 +292,27 @@ def pictures(study: Study, side: int = 320) -> list[tuple[str, str]]:
     chosen = [("best", i) for i in ranked[:3]]
     chosen += [("median", i) for i in ranked[max(middle - 1, 3) : middle + 2] if i not in ranked[-3:]]
     chosen += [("worst", i) for i in ranked[-3:][::-1] if i not in ranked[:3]]
-    rows = {(r.scene_id, r.im_id, r.obj_id): r for r in read_results(next(run["folder"].glob("*.csv")))}
+    rows = {(r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next(run["folder"].glob("*.csv")))}
+    drawn = draw_models(study, [one for _, one in chosen], rows)
     found = []
-    for kind, one in chosen:
+    for (kind, one), model in zip(chosen, drawn, strict=True):
         place = (one["scene_id"], one["im_id"], one["obj_id"])
-        frame, mesh, row = dataset.frame(*place[:2]), dataset.mesh(place[2]), rows[place]
+        frame, mesh, row = dataset.frame(*place[:2]), dataset.mesh(place[2]), rows[*place, one["score"]]
         truth = next(t for t in dataset.truths(*place[:2]) if t.index == one["index"])
-        image, covered = np.ascontiguousarray(frame.rgb), np.zeros(frame.rgb.shape[:2], bool)
-        estimate = (np.reshape(row.rotation, (3, 3)), np.asarray(row.translation) * MM)
-        for (rotation, translation), colour in (
-            ((truth.rotation, truth.translation), (40, 220, 90)),
-            (estimate, (235, 50, 60)),
-        ):
-            shape = silhouette(mesh.vertices @ rotation.T + translation, mesh.faces, frame.camera, *covered.shape)
-            outline, _ = cv2.findContours(shape.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-            cv2.drawContours(image, outline, -1, colour, 2)
-            covered |= shape
-        y, x = np.nonzero(covered) if covered.any() else (np.array([0, covered.shape[0] - 1]),) * 2
-        half = int(max(np.ptp(x), np.ptp(y)) * 0.65) + 10
-        top, left = max(int(y.mean()) - half, 0), max(int(x.mean()) - half, 0)
-        cut = image[top : top + 2 * half, left : left + 2 * half]
-        zoom = side / max(cut.shape[:2])
-        cut = cv2.resize(cut, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_LINEAR)
-        _, coded = cv2.imencode(".jpg", cut[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+        shapes = [
+            silhouette(mesh.vertices @ R.T + t, mesh.faces, frame.camera, *frame.rgb.shape[:2])
+            for R, t in ((truth.rotation, truth.translation), row_pose(row))
+        ]
+        box = square_around(shapes[0] | shapes[1])
+        photo = resize(cut(frame.rgb, box), side)
+        for shape, colour in zip(shapes, ((40, 220, 90), (235, 50, 60)), strict=True):
+            enlarged = resize(cut(shape.astype(np.uint8) * 255, box), side, smooth=True) > 127
+            outline, _ = cv2.findContours(enlarged.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+            cv2.drawContours(photo, outline, -1, colour, 3 if colour[0] < 100 else 1, cv2.LINE_AA)
+        grey = (0.35 * frame.rgb.mean(-1, keepdims=True) + 120).astype(np.uint8)
+        beside = np.where(model.any(-1, keepdims=True), model, np.repeat(grey, 3, axis=-1))
+        both = np.concatenate([photo, resize(cut(beside, box), side)], axis=1)
+        _, coded = cv2.imencode(".jpg", both[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
         off = f"{100 * error(one):.0f} % of the diameter" if math.isfinite(error(one)) else "more than a diameter"
         caption = (
             f"{kind}: scene {place[0]}, image {place[1]}, object {place[2]}; MSSD {off}, rotation "
@@ -321,6 +320,74 @@ def pictures(study: Study, side: int = 320) -> list[tuple[str, str]]:
         )
         found.append((caption, "data:image/jpeg;base64," + base64.b64encode(coded.tobytes()).decode()))
     return found
+
+
+def row_pose(row: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation in metres of a line of a result file."""
+    return np.reshape(row.rotation, (3, 3)), np.asarray(row.translation) * 1e-3
+
+
+def draw_models(study: Study, chosen: list[dict], rows: dict) -> list[np.ndarray]:
+    """The scanned model of each target at its estimate, on black: outlines cannot tell a front from a back."""
+    import jax.numpy as jnp
+
+    from ipjax.host.bop import Dataset
+    from ipjax.host.rendering import render_each
+    from ipjax.types import Camera, Similarity
+
+    dataset = Dataset(study.data, study.main["dataset"].rsplit("-", 1)[1], models=study.models)
+    pictures: list[np.ndarray] = [np.zeros(0)] * len(chosen)
+    by_size: dict[tuple[int, int], list[int]] = {}
+    for i, one in enumerate(chosen):
+        by_size.setdefault(dataset.image_size(one["scene_id"], one["im_id"]), []).append(i)
+    for (width, height), mine in by_size.items():
+        objects = sorted({chosen[i]["obj_id"] for i in mine})
+        poses, cameras = [], []
+        for i in mine:
+            one = chosen[i]
+            poses.append(row_pose(rows[one["scene_id"], one["im_id"], one["obj_id"], one["score"]]))
+            cameras.append(dataset.camera(one["scene_id"], one["im_id"])[0])
+        K = np.stack(cameras)
+        drawn = render_each(
+            [dataset.mesh(obj, "models") for obj in objects],
+            [objects.index(chosen[i]["obj_id"]) for i in mine],
+            Similarity(
+                jnp.asarray(np.stack([R for R, _ in poses]), jnp.float32),
+                jnp.asarray(np.stack([t for _, t in poses]), jnp.float32),
+                jnp.ones(len(poses), jnp.float32),
+            ),
+            Camera(jnp.asarray(K[:, [0, 1], [0, 1]], jnp.float32), jnp.asarray(K[:, :2, 2], jnp.float32)),
+            height,
+            width,
+        )
+        for i, rgb, mask in zip(mine, drawn.rgb, drawn.mask, strict=True):
+            pictures[i] = np.maximum(rgb, 1) * mask[..., None]  # black parts of the object are no background
+    return pictures
+
+
+def square_around(covered: np.ndarray) -> tuple[int, int, int]:
+    """Top, left and side of a square around what is covered, with a margin; it may reach out of the image."""
+    y, x = np.nonzero(covered) if covered.any() else (np.array([0, covered.shape[0] - 1]),) * 2
+    half = int(max(np.ptp(x), np.ptp(y)) * 0.6) + 10
+    return (int(y.min()) + int(y.max())) // 2 - half, (int(x.min()) + int(x.max())) // 2 - half, 2 * half
+
+
+def cut(image: np.ndarray, box: tuple[int, int, int]) -> np.ndarray:
+    """The square of an image, black where it reaches out."""
+    top, left, side = box
+    result = np.zeros((side, side, *image.shape[2:]), image.dtype)
+    inside = image[max(top, 0) : max(top + side, 0), max(left, 0) : max(left + side, 0)]
+    down, across = max(-top, 0), max(-left, 0)
+    result[down : down + inside.shape[0], across : across + inside.shape[1]] = inside
+    return result
+
+
+def resize(image: np.ndarray, side: int, *, smooth: bool = False) -> np.ndarray:
+    """A square image of another size."""
+    import cv2
+
+    way = cv2.INTER_AREA if len(image) > side and not smooth else cv2.INTER_LINEAR
+    return np.ascontiguousarray(cv2.resize(image, (side, side), interpolation=way))
 
 
 def html_table(rows: list[list[str]]) -> str:
@@ -333,10 +400,10 @@ def html_table(rows: list[list[str]]) -> str:
 def page(studies: list[Study]) -> str:
     """The whole page, in one file."""
     style = (
-        "body{font:15px/1.5 system-ui,sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}"
+        "body{font:15px/1.5 system-ui,sans-serif;max-width:1240px;margin:2em auto;padding:0 1em;color:#222}"
         "table{border-collapse:collapse;margin:.5em 0;font-size:14px}td,th{padding:.2em .7em;border-bottom:1px solid "
         "#ddd;text-align:right;white-space:nowrap}td:first-child,th:first-child{text-align:left}figure{display:"
-        "inline-block;width:320px;margin:.4em;vertical-align:top}figcaption{font-size:13px}svg text{font-size:11px;"
+        "inline-block;width:540px;margin:.4em;vertical-align:top}figcaption{font-size:13px}svg text{font-size:11px;"
         "fill:#444}.key span{padding:.1em .6em;color:#fff;margin-right:.5em;border-radius:3px}.wide{overflow-x:auto}"
         "h2{margin-top:2em;border-bottom:2px solid #1b6ca8}"
     )
@@ -361,10 +428,13 @@ def page(studies: list[Study]) -> str:
         out.append(curve(runs, "scale", 100, 40, "scale error, % (methods that have to find it)"))
         out.append(f"<h3>{HEADS[study.metrics[-1]]} per object, %</h3><p class=key>{key}</p>")
         out.append(f"<div class=wide>{bars(study)}</div>")
-        out.append(f"<h3>Targets of {html.escape(study.main['method'])}</h3><p>Green: annotated. Red: estimated.</p>")
+        out.append(
+            f"<h3>Targets of {html.escape(study.main['method'])}</h3><p>Left: the photo, outlined where the object is "
+            "annotated (green) and estimated (red). Right: the scanned model, drawn at the estimate.</p>"
+        )
         for caption, url in pictures(study):
             told = html.escape(caption)
-            out.append(f'<figure><img alt="{told}" src="{url}" width=320><figcaption>{told}</figcaption></figure>')
+            out.append(f'<figure><img alt="{told}" src="{url}" width=520><figcaption>{told}</figcaption></figure>')
     return "\n".join(out) + "</html>\n"
 
 

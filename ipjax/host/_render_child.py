@@ -157,7 +157,8 @@ def main(folder: Path) -> None:
     set_light(scene, job["light"])
     # A frame lists only what it shows: meshes shrunk to a point would cost as much as the others.
     geoms = [scene.geoms[i] for i in range(scene.ngeom)]
-    looks = {geom.objid: (geom.dataid, geom.matid, geom.texcoord) for geom in geoms}
+    names = [name for name in ("dataid", "matid", "texid", "texcoord") if hasattr(geoms[0], name)]
+    looks = {geom.objid: [(name, getattr(geom, name)) for name in names] for geom in geoms}
 
     def output(name: str, dtype: str, *tail: int) -> np.memmap:
         return np.lib.format.open_memmap(
@@ -175,7 +176,8 @@ def main(folder: Path) -> None:
         shown = np.flatnonzero(poses[frame, :, :, :3].any((1, 2))).tolist()
         for slot, i in enumerate(shown):
             geom = scene.geoms[slot]
-            geom.dataid, geom.matid, geom.texcoord = looks[i]
+            for name, value in looks[i]:
+                setattr(geom, name, value)
             geom.mat[:] = poses[frame, i, :, :3]
             geom.pos[:] = poses[frame, i, :, 3]
             geom.segid = i
