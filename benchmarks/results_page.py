@@ -189,15 +189,7 @@ def preamble(studies: list[Study]) -> list[str]:
 
 def notes(study: Study) -> list[str]:
     """What the runs have to say of themselves, once each."""
-    aligned = {n for run in study.runs for n in run["notes"] if n.startswith("object ")}
-    told = [n for run in study.runs for n in run["notes"] if n not in aligned and "true size" not in n]
-    if len(aligned) > 3:
-        told.append(
-            f"{len(aligned)} objects by meshes other than their models, moved to the models' frames by the known map "
-            "(for evaluation only)"
-        )
-    else:
-        told += sorted(aligned)
+    told = [note for run in study.runs for note in run["notes"] if "true size" not in note]
     return [f"{note}." for note in dict.fromkeys(told)]
 
 

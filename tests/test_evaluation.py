@@ -157,6 +157,27 @@ def test_an_alignment_moves_the_mesh_and_is_named(small, tmp_path):
         evaluation.read_alignment(path)
 
 
+def test_recalls_with_and_without_doubtful_images(tmp_path):
+    dataset = bop.Dataset(write_images(tmp_path / "two", scenes=2, images=2))
+    rows = [r for r in true_rows(dataset) if (r.scene_id, r.im_id) != (0, 0)]
+    found = evaluation.score(rows, dataset, ("mssd",), without=[(0, 0)], samples=20)
+    recalls = {title: (part.images, part.targets, part.recalls["mssd"]) for title, part in found.parts().items()}
+    assert recalls == {
+        "one frame per scene": (2, 4, 0.5),
+        "all frames": (4, 8, 0.75),
+        "one frame per scene, without 0/0": (2, 4, 1.0),  # the next frame of the scene stands in
+        "all frames, without 0/0": (3, 6, 1.0),
+    }
+    assert "all frames, without 0/0" in found.table() and "in doubt" in found.table()
+    assert evaluation.score(rows, dataset, ("mssd",), samples=0).without == {}
+    with pytest.raises(DatasetError, match="scene 0, image 7 is no target image"):
+        evaluation.score(rows, dataset, ("mssd",), without=[(0, 7)])
+    assert bop.parse_images(["3/138"]) == [(3, 138)] and bop.parse_images(None) == []
+    for bad in ("3", "3/", "a/1", "3-138"):
+        with pytest.raises(ValueError, match="give SCENE/IMAGE"):
+            bop.parse_images([bad])
+
+
 def test_rows_of_things_that_do_not_exist(small, tmp_path):
     rows = true_rows(small)
     for bad, says in ((replace(rows[0], obj_id=77), "no object 77"), (replace(rows[0], im_id=500), "no image 500")):
@@ -259,6 +280,47 @@ def test_results_of_other_settings_are_refused(small, tmp_path):
     run(small, tmp_path, Noisy(small), settings={"resolution": 224})
     with pytest.raises(DatasetError, match="other settings"):
         run(small, tmp_path, Noisy(small), settings={"resolution": 448})
+
+
+@pytest.mark.parametrize(("restart", "seed", "calls"), [("changed", 0, 0), ("changed", 1, 4), ("always", 0, 4)])
+def test_beginning_anew(small, tmp_path, restart, seed, calls):
+    run(small, tmp_path, Noisy(small), settings={"seed": 0})
+    again = Noisy(small)
+    run(small, tmp_path, again, settings={"seed": seed}, restart=restart)
+    assert len(again.calls) == calls
+    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 1 + 4
+    head = json.loads((tmp_path / "results.jsonl").read_text().splitlines()[0])
+    assert head["settings"] == {"seed": seed}
+
+
+def test_time_that_another_has_spent_is_counted(small, tmp_path):
+    class Sharing(Noisy):
+        shared_seconds = 0.0
+        notes = ("told the size",)
+
+        def __call__(self, frame, targets):
+            self.shared_seconds += 10.0
+            return super().__call__(frame, targets)
+
+    found = run(small, tmp_path, Sharing(small))
+    assert found.seconds_per_image is not None and 10 <= found.seconds_per_image < 11
+    assert "Note: told the size." in found.table()
+
+
+def test_results_hang_on_the_code():
+    """Every file whose change can change an estimate is in the hash; none of those that only print or score."""
+    code = studies.hash_code()
+    assert re.fullmatch("[0-9a-f]{12}", code) and code == studies.hash_code()
+    read: list[str] = []
+    path, opened = Path, Path.read_bytes
+    try:
+        path.read_bytes = lambda self: (read.append(self.name), opened(self))[1]  # type: ignore[method-assign]
+        studies.hash_code()
+    finally:
+        path.read_bytes = opened  # type: ignore[method-assign]
+    stages = {f"{n}.py" for n in ("pipeline", "matching", "alignment", "refinement", "scoring", "config", "frames")}
+    assert stages | {"neighbours.py", "consensus.py", "rasterize.py"} <= set(read)
+    assert not {"cli.py", "evaluation.py", "metrics.py"} & set(read)
 
 
 def test_a_failure_stops_or_counts_as_a_miss(small, tmp_path):

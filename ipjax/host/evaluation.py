@@ -430,10 +430,13 @@ def score(
 
 
 def _alignment_notes(alignments: Mapping[int, Alignment]) -> list[str]:
+    by_source: dict[str, list[int]] = {}
+    for obj_id, alignment in sorted(alignments.items()):
+        by_source.setdefault(alignment.source or "an alignment", []).append(obj_id)
     return [
-        f"object {obj_id}: a reconstructed mesh, moved to the model's frame by {alignment.source or 'an alignment'}"
-        " (fitted to the model, for evaluation only)"
-        for obj_id, alignment in sorted(alignments.items())
+        f"object{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}: another mesh than the model, moved to "
+        f"the model's frame by {source} (for evaluation only; the method does not see it)"
+        for source, numbers in by_source.items()
     ]
 
 
