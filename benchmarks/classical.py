@@ -38,7 +38,7 @@ class Settings:
     iterations: int = 100_000
     confidence: float = 0.999
     icp_steps: int = 60
-    icp_reach: float = 0.8
+    icp_reach: tuple[float, ...] = (4.0, 1.5)  # from coarse to fine
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,14 +171,16 @@ class Classical:
             ],
             registration.RANSACConvergenceCriteria(options.iterations, options.confidence),
         )
-        fine = registration.registration_icp(
-            scene,
-            body,
-            options.icp_reach * voxel,
-            coarse.transformation,
-            registration.TransformationEstimationPointToPlane(),
-            registration.ICPConvergenceCriteria(max_iteration=options.icp_steps),
-        )
+        fine = coarse
+        for reach in options.icp_reach:
+            fine = registration.registration_icp(
+                scene,
+                body,
+                reach * voxel,
+                fine.transformation,
+                registration.TransformationEstimationPointToPlane(),
+                registration.ICPConvergenceCriteria(max_iteration=options.icp_steps),
+            )
         camera_from_body = np.linalg.inv(fine.transformation)
         if not np.isfinite(camera_from_body).all() or fine.fitness == 0:
             return None

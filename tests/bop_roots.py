@@ -26,8 +26,9 @@ def write_models(root: Path) -> None:
     (folder / "models_info.json").write_text(json.dumps(infos))
 
 
-def write_protocol(root: Path) -> Path:
-    """The golden protocol as a data set without images; ``camera.json`` says how large they are."""
+def write_protocol(root: Path, copies: int = 1) -> Path:
+    """The golden protocol as a data set without images; ``camera.json`` says how large they are. Of several ``copies``
+    each has scenes of its own, 100 further on."""
     write_models(root)
     width, height = (int(x) for x in ERRORS["im_size_wh"])
     (root / "camera.json").write_text(json.dumps({"width": width, "height": height}))
@@ -45,14 +46,19 @@ def write_protocol(root: Path) -> Path:
         )
         infos.setdefault(scene, {}).setdefault(image, []).append({"visib_fract": float(PROTOCOL["gt_visib"][i])})
     camera = {"cam_K": ERRORS["K"].ravel().tolist(), "depth_scale": 0.1}
+    names = ("scene_id", "im_id", "obj_id", "inst_count")
+    rows = PROTOCOL["targets"].tolist()
+    for copy in range(1, copies):
+        rows += [[scene + 100 * copy, *rest] for scene, *rest in PROTOCOL["targets"].tolist()]
+        for scene in [s for s in truths if s < 100]:
+            truths[scene + 100 * copy], infos[scene + 100 * copy] = truths[scene], infos[scene]
     for scene in truths:
         folder = root / "test" / f"{scene:06d}"
         folder.mkdir(parents=True)
         (folder / "scene_gt.json").write_text(json.dumps(truths[scene]))
         (folder / "scene_gt_info.json").write_text(json.dumps(infos[scene]))
         (folder / "scene_camera.json").write_text(json.dumps(dict.fromkeys(truths[scene], camera)))
-    names = ("scene_id", "im_id", "obj_id", "inst_count")
-    targets = [dict(zip(names, row, strict=True)) for row in PROTOCOL["targets"].tolist()]
+    targets = [dict(zip(names, row, strict=True)) for row in rows]
     (root / "test_targets_bop19.json").write_text(json.dumps(targets))
     return root
 

@@ -434,8 +434,8 @@ def _alignment_notes(alignments: Mapping[int, Alignment]) -> list[str]:
     for obj_id, alignment in sorted(alignments.items()):
         by_source.setdefault(alignment.source or "an alignment", []).append(obj_id)
     return [
-        f"object{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}: another mesh than the model, moved to "
-        f"the model's frame by {source} (for evaluation only; the method does not see it)"
+        f"object{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}: another mesh than the model, moved "
+        f"to the model's frame by {source} (for evaluation only; the method does not see it)"
         for source, numbers in by_source.items()
     ]
 
