@@ -49,6 +49,11 @@ class Study:
         self.title, self.dataset, self.folder, self.options, self.meshes = title, dataset, folder, options, meshes
         self._finder: studies.Finder | None = None
 
+    @property
+    def objects(self) -> list[int] | None:
+        """What is asked for; of a reconstruction, its object alone."""
+        return list(self.meshes["meshes"]) if "meshes" in self.meshes else self.options.only
+
     def run(self, encoder: Any, methods: list[str]) -> list[Path]:
         """The folders of results, in the order of the methods."""
         print(f"\n== {self.title}", flush=True)
@@ -84,7 +89,7 @@ class Study:
         """What runs, the alignment of each object or None, and the name in the tables."""
         seed = self.options.seed
         if method == "classical":
-            bodies = read_bodies(self.dataset, objects=self.options.only or self.meshes.get("meshes"), **self.meshes)
+            bodies = read_bodies(self.dataset, objects=self.objects, **self.meshes)
             return Classical(bodies, seed=seed), {o: b.alignment for o, b in bodies.items()}, "classical"
         config = studies.read_config(method)
         if self._finder is None:
@@ -92,7 +97,7 @@ class Study:
                 self.dataset,
                 encoder,
                 folder=self.options.objects,
-                objects=self.options.only or self.meshes.get("meshes"),
+                objects=self.objects,
                 progress=not self.options.quiet,
                 **self.meshes,
             )
