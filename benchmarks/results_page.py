@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import describe_device
+from ipjax.host.evaluation import FEW
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
 HEADS = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
@@ -140,7 +141,9 @@ def tables(study: Study) -> list[tuple[str, list[list[str]]]]:
     for run in runs:
         a, seconds = run["add"], run["seconds_per_image"]
         cells = [*median_cells(run), str(run["missing"])]
-        cells += [percent(a.get(k)) for k in ("add_s_auc", "add_or_s_auc", "add_s_01d")]
+        few = run["all_frames"]["targets"] < FEW
+        cells += [percent(None if few else a.get(k)) for k in ("add_s_auc", "add_or_s_auc")]
+        cells += [percent(a.get("add_s_01d"))]
         rows.append([run["method"], *cells, "–" if seconds is None else f"{seconds:.1f}"])
     found.append(("Medians of what was found, areas under the curve to 10 cm, time", rows))
     metric = names[-1]
@@ -281,9 +284,12 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
     if not ranked:
         return []
     middle = len(ranked) // 2
-    chosen = [("best", i) for i in ranked[:3]]
-    chosen += [("median", i) for i in ranked[max(middle - 1, 3) : middle + 2] if i not in ranked[-3:]]
-    chosen += [("worst", i) for i in ranked[-3:][::-1] if i not in ranked[:3]]
+    if len(ranked) < 9:
+        chosen = [(f"{k} of {len(ranked)}", i) for k, i in enumerate(ranked, start=1)]
+    else:
+        chosen = [("best", i) for i in ranked[:3]]
+        chosen += [("median", i) for i in ranked[middle - 1 : middle + 2]]
+        chosen += [("worst", i) for i in ranked[-3:][::-1]]
     rows = {(r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next(run["folder"].glob("*.csv")))}
     drawn = draw_models(study, [one for _, one in chosen], rows)
     found = []
@@ -392,7 +398,7 @@ def html_table(rows: list[list[str]]) -> str:
 def page(studies: list[Study]) -> str:
     """The whole page, in one file."""
     style = (
-        "body{font:15px/1.5 system-ui,sans-serif;max-width:1240px;margin:2em auto;padding:0 1em;color:#222}"
+        "body{font:15px/1.5 system-ui,sans-serif;max-width:1400px;margin:2em auto;padding:0 1em;color:#222}"
         "table{border-collapse:collapse;margin:.5em 0;font-size:14px}td,th{padding:.2em .7em;border-bottom:1px solid "
         "#ddd;text-align:right;white-space:nowrap}td:first-child,th:first-child{text-align:left}figure{display:"
         "inline-block;width:540px;margin:.4em;vertical-align:top}figcaption{font-size:13px}svg text{font-size:11px;"

@@ -48,6 +48,9 @@ from ipjax.types import Camera, Similarity
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
 YCBV_SYMMETRIC = frozenset({1, 13, 14, 16, 18, 19, 20, 21})  # ADD(-S) uses ADD-S for these (dataset_params.py)
 DELTA = 0.015  # metres: VSD's visibility tolerance
+FEW = (
+    10  # targets below which no AUC is told: the toolbox's curve takes its higher value, so one target under 10 cm is 1
+)
 DETECTIONS = 100  # estimates per image that count for average precision (BOP 2024)
 BATCH = 64  # pairs of poses per call
 DRAWN = 48_000_000  # pixels drawn by one process for VSD; seven bytes each
@@ -940,10 +943,13 @@ def _table(found: Score) -> str:
         )
     if found.add:
         a = found.add
-        lines.append(
+        area = (
             f"AUC to 10 cm: ADD {100 * a['add_auc']:.1f}, ADD-S {100 * a['add_s_auc']:.1f}, ADD(-S) "
-            f"{100 * a['add_or_s_auc']:.1f}; below 0.1 d: ADD(-S) {100 * a['recall_01d']:.1f} %, ADD-S "
-            f"{100 * a['add_s_01d']:.1f} %."
+            f"{100 * a['add_or_s_auc']:.1f}; below"
+        )
+        lines.append(
+            f"{area if found.all_frames.targets >= FEW else 'Below'} 0.1 d: ADD(-S) {100 * a['recall_01d']:.1f} %, "
+            f"ADD-S {100 * a['add_s_01d']:.1f} %."
         )
     if found.precision:
         p = found.precision
