@@ -101,7 +101,7 @@ class Study:
                 progress=not self.options.quiet,
                 **self.meshes,
             )
-            self._finder = studies.Finder(known, encoder, config, seed=seed)
+            self._finder = studies.Finder(known, encoder, config, seed=seed, share=True)
             finder = self._finder
         else:
             finder = self._finder.beside(config)

@@ -106,7 +106,8 @@ def test_one_command_runs_all_and_makes_the_page(place, whole):
     words = ["benchmark", place / "balls", "--methods", place / "quicker.json", place / "quick.json", "--quiet"]
     words += ["--objects", place / "objects", "-o", place / "study", "--page", place / "page" / "accuracy"]
     out = finish(start(*words))
-    # The second method uses what the first has loaded and described: same answers, and its time says so.
+    # The second method uses what the first has loaded and described, and its answers are the same.
+    assert "shared: True 1" in out
     mine, theirs = results(place / "study" / "balls" / "scans" / "quick"), results(place / "whole")
     assert mine[0] == theirs[0]
     assert mine[1]["all_frames"] == theirs[1]["all_frames"]

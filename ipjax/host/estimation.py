@@ -85,13 +85,14 @@ class Estimator:
         key = jax.random.key(seed)
         known = {} if diameter is None else {"diameter": jnp.asarray(diameter, jnp.float32)}
 
-        if patches is None:
+        described: Any = patches
+        if described is None:
             see = self._ready("describe", describe, seconds, self.encoder, view)
             start = time.perf_counter()
-            patches = jax.block_until_ready(see(self.encoder, view))
+            described = jax.block_until_ready(see(self.encoder, view))
             seconds["describe"] = time.perf_counter() - start
 
-        query = Query(patches=patches, view=view)
+        query = Query(patches=described, view=view)
         find = self._ready("estimate", estimate, seconds, templates, query, key, self.config, **known)
         start = time.perf_counter()
         found = jax.block_until_ready(find(templates, query, key, self.config, **known))

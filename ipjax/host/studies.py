@@ -28,6 +28,7 @@ from ipjax.host.objects import FORMAT, load, save
 from ipjax.host.onboarding import onboard
 from ipjax.host.reports import compose
 from ipjax.host.weights import cache_folder, hash_file
+from ipjax.types import Patches, Similarity, View
 
 log = logging.getLogger("ipjax")
 
@@ -234,6 +235,7 @@ class Finder:
         seed: same seed, same answers.
         known_size: tell the estimate the object's true diameter.
         keep: also keep the `Result` of every target in ``results``, for pictures.
+        share: keep the description of each target's crop (of the first few hundred) for those made by `beside`.
     """
 
     def __init__(
@@ -246,6 +248,7 @@ class Finder:
         seed: int = 0,
         known_size: bool = False,
         keep: bool = False,
+        share: bool = False,
     ):
         self.known = dict(known)
         self.encoder = encoder
@@ -255,13 +258,15 @@ class Finder:
         self.notes = ["the method was told each object's true size"] if known_size else []
         self.compile_seconds = 0.0  # not counted as time per image
         self.shared_seconds = 0.0  # counted as if it had been spent here
-        self.described: dict[tuple[int, int, int, int], tuple[Any, Any, float]] | None = None
+        self.described: dict[tuple[int, int, int, int], tuple[tuple[View, Similarity], Patches, float]] | None = (
+            {} if share else None
+        )
         self.refused: list[str] = []  # targets that could not be tried, and why
         self.results: dict[tuple[int, int, int], Result] = {}
 
     def beside(self, config: Config) -> "Finder":
-        """The same with another configuration: objects are loaded once, and of each target's crop, which hangs on no
-        setting, the description is kept for the other (of the first few hundred)."""
+        """The same with another configuration: objects are loaded once, and crops, whose descriptions hang on no
+        setting of the estimate, are described once where this one was made to ``share``."""
         other = Finder(
             self.known,
             self.encoder,
@@ -271,8 +276,6 @@ class Finder:
             known_size=self.known_size,
             keep=self.keep,
         )
-        if self.described is None:
-            self.described = {}
         other.described, other.order, other.estimator.objects = self.described, self.order, self.estimator.objects
         return other
 
@@ -304,12 +307,14 @@ class Finder:
                 continue
             index = self._index(target.obj_id)
             key = (frame.scene_id, frame.im_id, target.obj_id, number)
-            crop, patches, seconds = (self.described or {}).get(key, (None, None, 0.0))
-            self.shared_seconds += seconds
+            kept = (self.described or {}).get(key)
             start = time.perf_counter()
             try:
-                if crop is None:
-                    crop = self.estimator.frame(index, frame.rgb, frame.depth, target.mask, frame.camera)
+                if kept is None:
+                    crop, patches = self.estimator.frame(index, frame.rgb, frame.depth, target.mask, frame.camera), None
+                else:
+                    crop, patches, seconds = kept
+                    self.shared_seconds += seconds
             except ValueError as error:  # nothing to be seen there: a miss
                 self.refused.append(f"{where}: {error}")
                 continue
