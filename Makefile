@@ -20,7 +20,7 @@ READY = $(VENV)/.ready
 # pytest's options, e.g. make pytest PYTEST="-k umeyama"
 PYTEST ?=
 
-.PHONY: help setup demo test lint format pytest bench eval notebooks dist clean
+.PHONY: help setup demo test lint format pytest bench eval results notebooks dist clean
 .DEFAULT_GOAL := help
 
 help:
@@ -30,6 +30,7 @@ help:
 	@echo "make format     let ruff rewrite what it can"
 	@echo "make bench      time the kernels and the pipeline on this machine"
 	@echo "make eval       accuracy on BOP data; DATA=folder in BOP layout"
+	@echo "make results    the page of results, benchmarks/results/accuracy.md and .html"
 	@echo "make notebooks  execute the notebooks again and store their figures"
 	@echo "make dist       build the wheel and the source archive"
 	@echo "make clean      remove what was built, $(VENV) too"
@@ -73,15 +74,23 @@ format: $(READY)
 bench: $(READY)
 	$(RUN) -m benchmarks --json out/benchmarks.json
 
-# Objects are onboarded once, into the cache, and shared by both runs; killed and called again, it goes on.
+# Objects are onboarded once, into the cache, and shared by all methods; killed and called again, it goes on.
 # WEIGHTS=file of the encoder, e.g. WEIGHTS=../shared/data/weights/dinov2_vits14_rederived_fp16.safetensors
+# OBJECTS=folder of object files, to keep them there instead of the cache.
 DATA ?= ../shared/data/ycbv
 EVALUATION ?= out/evaluation
+MEASURE = $(RUN) -m benchmarks.evaluation $(if $(WEIGHTS),--weights $(WEIGHTS)) $(if $(OBJECTS),--objects $(OBJECTS)) -o $(EVALUATION)
 eval: $(READY)
-	$(BIN)/ipjax evaluate $(DATA) -o $(EVALUATION)/paper --config paper $(if $(WEIGHTS),--weights $(WEIGHTS))
-	$(BIN)/ipjax evaluate $(DATA) -o $(EVALUATION)/default $(if $(WEIGHTS),--weights $(WEIGHTS)) \
-	  --against $(EVALUATION)/paper/ipjax-paper_$(notdir $(abspath $(DATA)))-test.csv
-	$(RUN) -m benchmarks.results_page $(EVALUATION)/default $(EVALUATION)/paper --data $(DATA) --html out/accuracy.html
+	$(MEASURE) $(DATA) --methods paper default
+
+# The page of results: both data sets, scans, degraded meshes and a reconstruction, and the classical baseline where
+# Open3D is installed. From nothing cached, each of LEVELS onboards every object (a minute each).
+FOLDER ?= ../shared/data
+LEVELS ?= 0 2 4
+results: $(READY)
+	$(MEASURE) $(FOLDER)/ycbv $(FOLDER)/dexycb --levels $(LEVELS) --page benchmarks/results/accuracy \
+	  --reconstruction $(FOLDER)/dexycb 5 $(FOLDER)/dexycb/instantmesh_mustard.obj \
+	  $(FOLDER)/dexycb/instantmesh_mustard_to_obj_000005.json
 
 notebooks: $(READY)
 	@for script in notebooks/*.py; do \

@@ -680,6 +680,7 @@ examples:
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
     parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the score as JSON")
+    parser.add_argument("--without", nargs="+", metavar="SCENE/IMAGE", help="also score without these images")
     parser.add_argument(
         "--skip-bad", action="store_true", help="leave damaged rows out and say so, instead of stopping"
     )
@@ -688,7 +689,7 @@ examples:
 def _score(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         _check_output(arguments.json, (".json",))
-    from ipjax.host.bop import Dataset
+    from ipjax.host.bop import Dataset, parse_images
     from ipjax.host.evaluation import score
 
     _use_cache()
@@ -700,6 +701,7 @@ def _score(arguments: argparse.Namespace) -> int:
         against=arguments.against,
         on_error="skip" if arguments.skip_bad else "raise",
         progress=sys.stderr.isatty(),
+        without=parse_images(arguments.without),
     )
     print(found.table())
     if arguments.json is not None:
@@ -723,7 +725,8 @@ examples:
 
 Objects are onboarded from the data set's models/ where that has not been done yet, and kept: in your cache, shared by
 all configurations, or in the folder that --objects names.
-Stop it at any moment and call it again: finished images are not done twice.
+Stop it at any moment and call it again: finished images are not done twice. Results of other settings, or of another
+state of the code, are not continued; --restart begins anew.
 """,
     )
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
@@ -752,6 +755,8 @@ Stop it at any moment and call it again: finished images are not done twice.
     parser.add_argument("--directions", type=_positive, metavar="N", help="viewpoints of new object files (default 40)")
     parser.add_argument("--rolls", type=_positive, metavar="N", help="in-plane rotations of each (default 10)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--without", nargs="+", metavar="SCENE/IMAGE", help="also score without these images")
+    parser.add_argument("--restart", action="store_true", help="forget what is in the folder of results")
     parser.add_argument("--skip-bad", action="store_true", help="count damaged images as misses, instead of stopping")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     _add_encoder(parser)
@@ -764,7 +769,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{arguments.against}: no such result file")
     from ipjax.config import OnboardConfig
     from ipjax.host import studies
-    from ipjax.host.bop import Dataset
+    from ipjax.host.bop import Dataset, parse_images
     from ipjax.host.evaluation import evaluate
 
     config = studies.read_config(arguments.config)
@@ -804,6 +809,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         progress=not arguments.quiet,
         metrics=arguments.metrics,
         against=arguments.against,
+        without=parse_images(arguments.without),
+        restart="always" if arguments.restart else "never",
     )
     print(found.table())
     for line in finder.refused:

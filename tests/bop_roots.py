@@ -26,8 +26,9 @@ def write_models(root: Path) -> None:
     (folder / "models_info.json").write_text(json.dumps(infos))
 
 
-def write_protocol(root: Path) -> Path:
-    """The golden protocol as a data set without images; ``camera.json`` says how large they are."""
+def write_protocol(root: Path, copies: int = 1) -> Path:
+    """The golden protocol as a data set without images; ``camera.json`` says how large they are. Of several ``copies``
+    each has scenes of its own, 100 further on."""
     write_models(root)
     width, height = (int(x) for x in ERRORS["im_size_wh"])
     (root / "camera.json").write_text(json.dumps({"width": width, "height": height}))
@@ -45,14 +46,19 @@ def write_protocol(root: Path) -> Path:
         )
         infos.setdefault(scene, {}).setdefault(image, []).append({"visib_fract": float(PROTOCOL["gt_visib"][i])})
     camera = {"cam_K": ERRORS["K"].ravel().tolist(), "depth_scale": 0.1}
+    names = ("scene_id", "im_id", "obj_id", "inst_count")
+    rows = PROTOCOL["targets"].tolist()
+    for copy in range(1, copies):
+        rows += [[scene + 100 * copy, *rest] for scene, *rest in PROTOCOL["targets"].tolist()]
+        for scene in [s for s in truths if s < 100]:
+            truths[scene + 100 * copy], infos[scene + 100 * copy] = truths[scene], infos[scene]
     for scene in truths:
         folder = root / "test" / f"{scene:06d}"
         folder.mkdir(parents=True)
         (folder / "scene_gt.json").write_text(json.dumps(truths[scene]))
         (folder / "scene_gt_info.json").write_text(json.dumps(infos[scene]))
         (folder / "scene_camera.json").write_text(json.dumps(dict.fromkeys(truths[scene], camera)))
-    names = ("scene_id", "im_id", "obj_id", "inst_count")
-    targets = [dict(zip(names, row, strict=True)) for row in PROTOCOL["targets"].tolist()]
+    targets = [dict(zip(names, row, strict=True)) for row in rows]
     (root / "test_targets_bop19.json").write_text(json.dumps(targets))
     return root
 
@@ -83,6 +89,55 @@ def write_images(root: Path, scenes: int = 1, images: int = 4) -> Path:
             rgb = random.integers(0, 255, (48, 64, 3), np.uint8)
             Image.fromarray(rgb).save(folder / "rgb" / f"{image:06d}.png")
             Image.fromarray(np.full((48, 64), 1400, np.uint16)).save(folder / "depth" / f"{image:06d}.png")
+        (folder / "scene_camera.json").write_text(json.dumps(camera))
+        (folder / "scene_gt.json").write_text(json.dumps(truth))
+    (root / "test_targets_bop19.json").write_text(json.dumps(targets))
+    return root
+
+
+def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 112) -> Path:
+    """A data set of exact images of the coloured ellipsoid of `problems`, alone in each, with its mesh as the model."""
+    import jax.numpy as jnp
+    import trimesh
+    from PIL import Image
+    from problems import AXES, random_rotation, see
+
+    from ipjax.types import Similarity
+
+    size = 200.0  # mm
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    points, colours = size * ball.vertices * AXES, np.round(255 * (0.5 + 0.45 * ball.vertices)).astype(int)
+    head = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
+    head += [f"property float {axis}" for axis in "xyz"] + [f"property uchar {c}" for c in ("red", "green", "blue")]
+    head += [f"element face {len(ball.faces)}", "property list uchar int vertex_indices", "end_header"]
+    body = [f"{x} {y} {z} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(points, colours, strict=True)]
+    body += [f"3 {a} {b} {c}" for a, b, c in ball.faces]
+    for folder in ("models", "models_eval"):
+        (root / folder).mkdir(parents=True)
+        (root / folder / "obj_000001.ply").write_text("\n".join(head + body) + "\n")
+        (root / folder / "models_info.json").write_text(json.dumps({"1": {"diameter": size}}))
+    random, targets = np.random.default_rng(3), []
+    for scene in range(scenes):
+        folder = root / "test" / f"{scene:06d}"
+        for kind in ("rgb", "depth", "mask_visib"):
+            (folder / kind).mkdir(parents=True)
+        camera, truth = {}, {}
+        for image in range(images):
+            rotation, shift = random_rotation(random), np.array([*random.uniform(-0.1, 0.1, 2), 0.7])
+            pose = Similarity(jnp.asarray(rotation), jnp.asarray(shift), jnp.asarray(size / 1000))
+            view = see(pose, side, fill=0.6)
+            (fx, fy), (cx, cy) = np.asarray(view.camera.focal).tolist(), np.asarray(view.camera.centre).tolist()
+            Image.fromarray(np.round(255 * np.asarray(view.rgb)).astype(np.uint8)).save(
+                folder / "rgb" / f"{image:06d}.png"
+            )
+            depth = np.round(np.asarray(view.depth) * 10_000).astype(np.uint16)
+            Image.fromarray(depth).save(folder / "depth" / f"{image:06d}.png")
+            mask = np.asarray(view.mask).astype(np.uint8) * 255
+            Image.fromarray(mask).save(folder / "mask_visib" / f"{image:06d}_000000.png")
+            camera[str(image)] = {"cam_K": [fx, 0, cx, 0, fy, cy, 0, 0, 1], "depth_scale": 0.1}
+            pose_mm = {"cam_R_m2c": rotation.ravel().tolist(), "cam_t_m2c": (1000 * shift).tolist()}
+            truth[str(image)] = [{"obj_id": 1, **pose_mm}]
+            targets.append({"scene_id": scene, "im_id": image, "obj_id": 1, "inst_count": 1})
         (folder / "scene_camera.json").write_text(json.dumps(camera))
         (folder / "scene_gt.json").write_text(json.dumps(truth))
     (root / "test_targets_bop19.json").write_text(json.dumps(targets))

@@ -60,6 +60,25 @@ def test_recalls_and_precisions_are_bops_exactly(golden_score):
     assert found.precision["map"] == pytest.approx(float(PROTOCOL["mAP_bop24"]), abs=1e-12)
 
 
+def test_thousands_of_estimates_in_a_file_agree_with_the_toolkit(tmp_path, monkeypatch, capfd):
+    """A root as LM-O's (scene-wise, models_eval, targets, no depth), through the command and a result file."""
+    from ipjax import cli
+
+    monkeypatch.setenv("IPJAX_NO_CACHE", "1")
+    copies = 30
+    root = write_protocol(tmp_path / "lmo", copies)
+    rows = [replace(r, scene_id=r.scene_id + 100 * k) for k in range(copies) for r in protocol_rows()]
+    shuffled = [rows[i] for i in np.random.default_rng(2).permutation(len(rows))]
+    path = bop.write_results(tmp_path / "other_lmo-test.csv", shuffled)
+    assert len(rows) > 2000
+    assert cli.main(["score", str(path), str(root), "--json", str(tmp_path / "score.json")]) == 0
+    assert "scored without VSD" in capfd.readouterr().out
+    found = json.loads((tmp_path / "score.json").read_text())["all_frames"]
+    assert found["targets"] == copies * int(PROTOCOL["targets_count"])
+    for name in ("mssd", "mspd"):
+        assert found["recalls"][name] == pytest.approx(float(PROTOCOL[f"AR_{name}"]), abs=1e-6)
+
+
 def test_recall_is_weighted_by_instances(golden_score):
     counts = np.array([entry["targets"] for entry in golden_score.objects.values()])
     recalls = np.array([entry["mssd"] for entry in golden_score.objects.values()])
@@ -155,6 +174,27 @@ def test_an_alignment_moves_the_mesh_and_is_named(small, tmp_path):
     path.write_text('{"scale": 1}')
     with pytest.raises(DatasetError, match="an alignment is JSON"):
         evaluation.read_alignment(path)
+
+
+def test_recalls_with_and_without_doubtful_images(tmp_path):
+    dataset = bop.Dataset(write_images(tmp_path / "two", scenes=2, images=2))
+    rows = [r for r in true_rows(dataset) if (r.scene_id, r.im_id) != (0, 0)]
+    found = evaluation.score(rows, dataset, ("mssd",), without=[(0, 0)], samples=20)
+    recalls = {title: (part.images, part.targets, part.recalls["mssd"]) for title, part in found.parts().items()}
+    assert recalls == {
+        "one frame per scene": (2, 4, 0.5),
+        "all frames": (4, 8, 0.75),
+        "one frame per scene, without 0/0": (2, 4, 1.0),  # the next frame of the scene stands in
+        "all frames, without 0/0": (3, 6, 1.0),
+    }
+    assert "all frames, without 0/0" in found.table() and "in doubt" in found.table()
+    assert evaluation.score(rows, dataset, ("mssd",), samples=0).without == {}
+    with pytest.raises(DatasetError, match="scene 0, image 7 is no target image"):
+        evaluation.score(rows, dataset, ("mssd",), without=[(0, 7)])
+    assert bop.parse_images(["3/138"]) == [(3, 138)] and bop.parse_images(None) == []
+    for bad in ("3", "3/", "a/1", "3-138"):
+        with pytest.raises(ValueError, match="give SCENE/IMAGE"):
+            bop.parse_images([bad])
 
 
 def test_rows_of_things_that_do_not_exist(small, tmp_path):
@@ -259,6 +299,47 @@ def test_results_of_other_settings_are_refused(small, tmp_path):
     run(small, tmp_path, Noisy(small), settings={"resolution": 224})
     with pytest.raises(DatasetError, match="other settings"):
         run(small, tmp_path, Noisy(small), settings={"resolution": 448})
+
+
+@pytest.mark.parametrize(("restart", "seed", "calls"), [("changed", 0, 0), ("changed", 1, 4), ("always", 0, 4)])
+def test_beginning_anew(small, tmp_path, restart, seed, calls):
+    run(small, tmp_path, Noisy(small), settings={"seed": 0})
+    again = Noisy(small)
+    run(small, tmp_path, again, settings={"seed": seed}, restart=restart)
+    assert len(again.calls) == calls
+    assert len((tmp_path / "results.jsonl").read_text().splitlines()) == 1 + 4
+    head = json.loads((tmp_path / "results.jsonl").read_text().splitlines()[0])
+    assert head["settings"] == {"seed": seed}
+
+
+def test_time_that_another_has_spent_is_counted(small, tmp_path):
+    class Sharing(Noisy):
+        shared_seconds = 0.0
+        notes = ("told the size",)
+
+        def __call__(self, frame, targets):
+            self.shared_seconds += 10.0
+            return super().__call__(frame, targets)
+
+    found = run(small, tmp_path, Sharing(small))
+    assert found.seconds_per_image is not None and 10 <= found.seconds_per_image < 11
+    assert "Note: told the size." in found.table()
+
+
+def test_results_hang_on_the_code():
+    """Every file whose change can change an estimate is in the hash; none of those that only print or score."""
+    code = studies.hash_code()
+    assert re.fullmatch("[0-9a-f]{12}", code) and code == studies.hash_code()
+    read: list[str] = []
+    path, opened = Path, Path.read_bytes
+    try:
+        path.read_bytes = lambda self: (read.append(self.name), opened(self))[1]  # type: ignore[method-assign]
+        studies.hash_code()
+    finally:
+        path.read_bytes = opened  # type: ignore[method-assign]
+    stages = {f"{n}.py" for n in ("pipeline", "matching", "alignment", "refinement", "scoring", "config", "frames")}
+    assert stages | {"neighbours.py", "consensus.py", "rasterize.py"} <= set(read)
+    assert not {"cli.py", "evaluation.py", "metrics.py"} & set(read)
 
 
 def test_a_failure_stops_or_counts_as_a_miss(small, tmp_path):
@@ -382,3 +463,81 @@ def test_several_objects_are_drawn_at_once(small):
         assert (alone > 0).any()
         np.testing.assert_array_equal(together[place] > 0, alone > 0)
         np.testing.assert_allclose(together[place], alone, atol=1e-6)
+
+
+# The command: malformed data sets and result files are told in a sentence
+
+ROW = "0,0,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,0.5"
+
+
+@pytest.fixture
+def scored(tmp_path, monkeypatch, capfd):
+    """Runs ``ipjax score`` on a small data set, damaged before: (status, standard output, standard error)."""
+    from ipjax import cli
+
+    monkeypatch.setenv("IPJAX_NO_CACHE", "1")
+    monkeypatch.delenv("IPJAX_DEBUG", raising=False)
+    root, path = write_images(tmp_path / "small", images=2), tmp_path / "mine_small-test.csv"
+    path.write_text(f"{bop.HEADER}\n{ROW}\n")
+
+    def run(damage, *words):
+        damage(root, path)
+        try:
+            status = cli.main(["score", str(path), str(root), "--metrics", "mssd", "mspd", *words])
+        except SystemExit as stop:
+            status = stop.code
+        return (status, *capfd.readouterr())
+
+    return run
+
+
+def rows(*lines):
+    return lambda root, path: path.write_text("\n".join([bop.HEADER, ROW, *lines]) + "\n")
+
+
+def written(name, text):
+    return lambda root, path: (root / name).write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (rows("0,1,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700"), "mine_small-test.csv, line 3: .*7 columns"),
+        (rows("0,1,2,1.0,1 0 0 0 1 0 0 0,0 0 700,1"), "mine_small-test.csv, line 3: R must hold 9 numbers, got 8"),
+        (rows("0,1,2,nan,1 0 0 0 1 0 0 0 1,0 0 700,1"), "mine_small-test.csv, line 3: .*not finite"),
+        (rows("0,1,2,1.0,1 0 0 0 nan 0 0 0 1,0 0 700,1"), "mine_small-test.csv, line 3: .*not finite"),
+        (rows("0,1,77,1.0,1 0 0 0 1 0 0 0 1,0 0 700,1"), "mine_small-test.csv, line 3: the data set has no object 77"),
+        (rows(ROW), "mine_small-test.csv, line 3: .*same as that of line 2"),
+        (rows("0,9,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,1"), "line 3: the data set has no image 9 in scene 0"),
+        (rows("8,0,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,1"), "line 3: the data set has no image 0 in scene 8"),
+        (lambda root, path: path.write_text("scene_id,im_id\n"), "mine_small-test.csv, line 1: the header must be"),
+        (lambda root, path: path.unlink(), "mine_small-test.csv: .*cannot be read"),
+        (lambda root, path: (root / "test/000000/rgb/000001.png").unlink(), "000001.png: no such image"),
+        (lambda root, path: (root / "models_eval/obj_000003.ply").unlink(), "obj_000003.ply: no such model"),
+        (written("test/000000/scene_gt.json", '{"0": [\n}'), "scene_gt.json, line 2: not valid JSON"),
+        (
+            written("test/000000/scene_gt.json", '{"0": [], "1": []}'),
+            "1 instances of object 2 in scene 0, image 0, but 0",
+        ),
+        (
+            written("test/000000/scene_camera.json", '{"0": {"cam_K": [1]}}'),
+            "scene_camera.json, image 0: cam_K must be 9",
+        ),
+        (written("models_eval/models_info.json", '{"2": {"diameter": 1}}'), "no object 3"),
+        (written("test_targets_bop19.json", '[{"scene_id": 0}]'), "test_targets_bop19.json, entry 0: "),
+    ],
+)
+def test_the_command_names_what_is_malformed(scored, damage, says):
+    status, out, error = scored(damage)
+    assert status == 2 and out == ""
+    assert error.count("\n") == 1 and "Traceback" not in error
+    assert re.search(says, error), error
+
+
+def test_the_command_scores_and_goes_on_where_asked(scored, tmp_path):
+    bad = "0,1,2,1.0,1 0 0 0 1 0 0 0,0 0 700,1"
+    status, out, _ = scored(rows(bad), "--skip-bad", "--without", "0/1", "--json", str(tmp_path / "score.json"))
+    assert status == 0 and "1 problems, the first: " in out and "R must hold 9 numbers" in out
+    assert "all frames, without 0/1" in out
+    kept = json.loads((tmp_path / "score.json").read_text())
+    assert kept["all_frames"]["targets"] == 4 and len(kept["problems"]) == 1 and set(kept["without"])

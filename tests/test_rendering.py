@@ -224,3 +224,29 @@ def test_bad_arguments_are_told():
     ):
         with pytest.raises(ValueError, match=r"\w+ \w+"):
             call()
+
+
+def test_each_image_shows_its_own_mesh_with_its_own_texture():
+    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    colours = [(200, 30, 40), (20, 180, 60), (50, 70, 210)]
+    meshes = [
+        make_mesh(
+            corners,
+            np.array([[0, 1, 2], [0, 2, 3]]),
+            uv=(corners[:, :2] + 1) / 2,
+            texture=np.full((4, 4, 3), colour, np.uint8),
+        )
+        for colour in colours
+    ]
+    which = [2, 0, 1, 2]
+    pose = Similarity(
+        jnp.broadcast_to(jnp.eye(3, dtype=jnp.float32), (4, 3, 3)),
+        jnp.broadcast_to(jnp.array([0.0, 0, 4], jnp.float32), (4, 3)),
+        jnp.ones(4, jnp.float32),
+    )
+    camera = Camera(focal=jnp.full(2, 20.0, jnp.float32), centre=jnp.full(2, 7.5, jnp.float32))
+    for backend in ("auto", "raster"):
+        drawn = rendering.render_each(meshes, which, pose, camera, 16, 16, backend=backend)
+        middle = drawn.rgb[:, 7, 7].astype(int)
+        np.testing.assert_allclose(middle, [colours[i] for i in which], atol=1)
+        np.testing.assert_allclose(drawn.depth[:, 7, 7], 4.0, atol=1e-5)

@@ -155,7 +155,10 @@ def main(folder: Path) -> None:
     mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, mujoco.MjvCamera(), everything, scene)
     scene.flags[:] = 0  # no culling: reconstructed meshes have holes; no shadow, fog, sky, reflection
     set_light(scene, job["light"])
-    geoms = {scene.geoms[i].objid: scene.geoms[i] for i in range(scene.ngeom)}
+    # A frame lists only what it shows: meshes shrunk to a point would cost as much as the others.
+    geoms = [scene.geoms[i] for i in range(scene.ngeom)]
+    names = [name for name in ("dataid", "matid", "texid", "texcoord") if hasattr(geoms[0], name)]
+    looks = {geom.objid: [(name, getattr(geom, name)) for name in names] for geom in geoms}
 
     def output(name: str, dtype: str, *tail: int) -> np.memmap:
         return np.lib.format.open_memmap(
@@ -170,10 +173,15 @@ def main(folder: Path) -> None:
     segmenting = [mujoco.mjtRndFlag.mjRND_SEGMENT.value, mujoco.mjtRndFlag.mjRND_IDCOLOR.value]
     for frame in range(frames):
         set_camera(scene, frusta[frame])
-        for i, geom in geoms.items():
+        shown = np.flatnonzero(poses[frame, :, :, :3].any((1, 2))).tolist()
+        for slot, i in enumerate(shown):
+            geom = scene.geoms[slot]
+            for name, value in looks[i]:
+                setattr(geom, name, value)
             geom.mat[:] = poses[frame, i, :, :3]
             geom.pos[:] = poses[frame, i, :, 3]
             geom.segid = i
+        scene.ngeom = len(shown)
         mujoco.mjr_render(rectangle, scene, context)
         mujoco.mjr_readPixels(colours, reading, rectangle, context)
         metric = metric_depth(reading[::-1], frusta[frame, 4], frusta[frame, 5])

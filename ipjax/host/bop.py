@@ -128,6 +128,17 @@ class ResultRow:
     line: int | None = field(default=None, compare=False)  # where it was read
 
 
+def parse_images(names: Iterable[str] | None) -> list[tuple[int, int]]:
+    """``["3/138"]`` as [(3, 138)]; ValueError names what is wrong."""
+    found = []
+    for name in names or ():
+        scene, slash, image = name.partition("/")
+        if not (slash and scene.isdigit() and image.isdigit()):
+            raise ValueError(f"{name}: give SCENE/IMAGE, for instance 3/138")
+        found.append((int(scene), int(image)))
+    return found
+
+
 class Dataset:
     """A BOP data set on disc.
 

@@ -12,9 +12,9 @@ import numpy as np
 from ipjax.config import Config
 from ipjax.features import describe
 from ipjax.host.frames import frame_turned
-from ipjax.host.objects import ObjectInfo, compact
+from ipjax.host.objects import ObjectInfo
 from ipjax.pipeline import estimate
-from ipjax.types import PoseEstimate, Query, Similarity, Templates
+from ipjax.types import Patches, PoseEstimate, Query, Similarity, Templates
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,6 @@ class Estimator:
         self.config = config
         self.options: dict[str, Any] = {"crop": "square"} | options
         self._compiled: dict[Any, Any] = {}
-        self._compact: set[int] = set()
 
     def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
         """The crop of one object, without looking at it yet: bad input is refused here.
@@ -63,7 +62,14 @@ class Estimator:
         return frame_turned(rgb, depth, mask, camera, box=box, **options)
 
     def run(
-        self, index: int, view: Any, camera_from_crop: Similarity, *, seed: int = 0, diameter: float | None = None
+        self,
+        index: int,
+        view: Any,
+        camera_from_crop: Similarity,
+        *,
+        seed: int = 0,
+        diameter: float | None = None,
+        patches: Patches | None = None,
     ) -> Result:
         """Estimate one object in its crop.
 
@@ -72,22 +78,21 @@ class Estimator:
             view, camera_from_crop: from `frame`.
             seed: same seed, same answer.
             diameter: the object's true diameter in metres, where it is known.
+            patches: of the view, where it has been described already.
         """
-        if index not in self._compact:
-            templates, info = self.objects[index]
-            self.objects[index] = compact(templates), info
-            self._compact.add(index)
         templates, info = self.objects[index]
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)
         known: dict[str, Any] = {} if diameter is None else {"diameter": jnp.asarray(diameter, jnp.float32)}
 
-        see = self._ready("describe", describe, seconds, self.encoder, view)
-        start = time.perf_counter()
-        patches = jax.block_until_ready(see(self.encoder, view))
-        seconds["describe"] = time.perf_counter() - start
+        described: Any = patches
+        if described is None:
+            see = self._ready("describe", describe, seconds, self.encoder, view)
+            start = time.perf_counter()
+            described = jax.block_until_ready(see(self.encoder, view))
+            seconds["describe"] = time.perf_counter() - start
 
-        query = Query(patches=patches, view=view)
+        query = Query(patches=described, view=view)
         known["encoder"] = self.encoder
         find = self._ready("estimate", estimate, seconds, templates, query, key, self.config, **known)
         start = time.perf_counter()

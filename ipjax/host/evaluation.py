@@ -48,6 +48,9 @@ from ipjax.types import Camera, Similarity
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
 YCBV_SYMMETRIC = frozenset({1, 13, 14, 16, 18, 19, 20, 21})  # ADD(-S) uses ADD-S for these (dataset_params.py)
 DELTA = 0.015  # metres: VSD's visibility tolerance
+FEW = (
+    10  # targets below which no AUC is told: the toolbox's curve takes its higher value, so one target under 10 cm is 1
+)
 DETECTIONS = 100  # estimates per image that count for average precision (BOP 2024)
 BATCH = 64  # pairs of poses per call
 DRAWN = 48_000_000  # pixels drawn by one process for VSD; seven bytes each
@@ -325,6 +328,7 @@ class Score:
     metrics: tuple[str, ...]
     all_frames: Summary
     one_frame_per_scene: Summary  # the first target image of each scene
+    without: dict[str, Summary]  # the same two, by title, without the images that the caller doubts; or empty
     curves: dict[str, list[float]]  # recall at each threshold
     objects: dict[int, dict[str, float]]  # average recalls (and others) by object
     medians: dict[str, float]  # rotation_deg, translation_mm, scale_percent over the instances that got an estimate
@@ -350,6 +354,10 @@ class Score:
         """The whole score, with every instance, as JSON."""
         return write_atomically(path, json.dumps(self.to_dict(), indent=1))
 
+    def parts(self) -> dict[str, Summary]:
+        """Recalls by title, the headline first."""
+        return {"one frame per scene": self.one_frame_per_scene, "all frames": self.all_frames, **self.without}
+
     def table(self) -> str:
         """What a person wants to see, as text."""
         return _table(self)
@@ -372,6 +380,7 @@ def score(
     method: str | None = None,
     notes: Sequence[str] = (),
     progress: bool = False,
+    without: Iterable[tuple[int, int]] = (),
 ) -> Score:
     """Score estimates on the targets of a data set.
 
@@ -388,13 +397,14 @@ def score(
         delta: VSD's visibility tolerance, metres (ITODD: 0.005).
         on_error: "raise" stops at the first damaged file or row; "skip" goes on and lists them in ``problems``.
         samples, seed: of the bootstrap.
+        without: images (scene, image) of doubtful annotation; the table has the recalls with and without them.
 
     Raises DatasetError, one sentence with file and line, for damaged results or data; ValueError for unknown metrics.
     """
     unknown = set(metrics) - set(METRICS)
     if unknown:
         raise ValueError(f"unknown metric {sorted(unknown)[0]!r}; choose from {', '.join(METRICS)}")
-    job = _Job(dataset, tuple(metrics), objects, delta, on_error, symmetric, progress)
+    job = _Job(dataset, tuple(metrics), objects, delta, on_error, symmetric, progress, without)
     job.notes += notes
     method = method or (Path(results).stem if isinstance(results, str | Path) else "results")
     rows = job.rows(results)
@@ -423,10 +433,13 @@ def score(
 
 
 def _alignment_notes(alignments: Mapping[int, Alignment]) -> list[str]:
+    by_source: dict[str, list[int]] = {}
+    for obj_id, alignment in sorted(alignments.items()):
+        by_source.setdefault(alignment.source or "an alignment", []).append(obj_id)
     return [
-        f"object {obj_id}: a reconstructed mesh, moved to the model's frame by {alignment.source or 'an alignment'}"
-        " (fitted to the model, for evaluation only)"
-        for obj_id, alignment in sorted(alignments.items())
+        f"object{'s' if len(numbers) > 1 else ''} {', '.join(map(str, numbers))}: another mesh than the model, moved "
+        f"to the model's frame by {source} (for evaluation only; the method does not see it)"
+        for source, numbers in by_source.items()
     ]
 
 
@@ -472,7 +485,7 @@ class _Slot:
 class _Job:
     """One run of `score`: what is asked for, what has been read, what went wrong."""
 
-    def __init__(self, dataset, metrics, objects, delta, on_error, symmetric, progress):
+    def __init__(self, dataset, metrics, objects, delta, on_error, symmetric, progress, without=()):
         self.dataset, self.metrics, self.delta, self.on_error = dataset, metrics, delta, on_error
         self.problems: list[str] = []
         self._annotations: dict[tuple[int, int], tuple[np.ndarray, int, list[Truth]]] = {}
@@ -482,6 +495,11 @@ class _Job:
         self.targets = [t for t in dataset.targets if chosen is None or t.obj_id in chosen]
         if not self.targets:
             raise DatasetError(f"{dataset.targets_file}: there are no targets to score")
+        self.without = sorted({(int(s), int(i)) for s, i in without})
+        there = {(t.scene_id, t.im_id) for t in dataset.targets}
+        for scene, image in self.without:
+            if (scene, image) not in there:
+                raise DatasetError(f"{dataset.targets_file}: scene {scene}, image {image} is no target image")
         self.infos = dataset.models()
         if symmetric is not None:
             self.symmetric = frozenset(symmetric)
@@ -747,10 +765,13 @@ def _summarise(job: _Job, slots: list[_Slot], rows, precision, method, samples, 
     counts = np.array([s.row.count for s in slots])
     images = {image: i for i, image in enumerate(dict.fromkeys((s.row.scene_id, s.row.im_id) for s in slots))}
     of_image = np.array([images[s.row.scene_id, s.row.im_id] for s in slots])
-    first: dict[int, int] = {}
-    for scene, image in images:
-        first[scene] = min(image, first.get(scene, image))
-    headline = np.array([s.row.im_id == first[s.row.scene_id] for s in slots], bool)
+    place = [(s.row.scene_id, s.row.im_id) for s in slots]
+
+    def one_per_scene(kept: Iterable[tuple[int, int]]) -> np.ndarray:
+        first: dict[int, int] = {}
+        for scene, image in kept:
+            first[scene] = min(image, first.get(scene, image))
+        return np.array([first.get(scene) == image for scene, image in place], bool)
 
     def summary(chosen: np.ndarray) -> Summary:
         recalls = _recalls(hits, counts, chosen, job.metrics)
@@ -763,6 +784,15 @@ def _summarise(job: _Job, slots: list[_Slot], rows, precision, method, samples, 
         )
 
     everything = np.ones(len(slots), bool)
+    trusted = np.array([p not in job.without for p in place], bool)
+    without: dict[str, Summary] = {}
+    if trusted.any() and not trusted.all():
+        told = ", ".join(f"{s}/{i}" for s, i in job.without if (s, i) in images)
+        kept = [image for image in images if image not in job.without]
+        without = {
+            f"one frame per scene, without {told}": summary(one_per_scene(kept)),
+            f"all frames, without {told}": summary(trusted),
+        }
     of_object = np.array([s.row.obj_id for s in slots])
     instances = _instances(slots)
     found = [i for i in instances if i.found]
@@ -779,7 +809,8 @@ def _summarise(job: _Job, slots: list[_Slot], rows, precision, method, samples, 
         method=method,
         metrics=job.metrics,
         all_frames=summary(everything),
-        one_frame_per_scene=summary(headline),
+        one_frame_per_scene=summary(one_per_scene(images)),
+        without=without,
         curves={n: (hits[n].sum(0) / counts.sum()).reshape(-1, 10).mean(0).tolist() for n in names},
         objects=per_object,
         medians=_medians(found),
@@ -888,7 +919,7 @@ def _table(found: Score) -> str:
     heads = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
     lines = [f"{found.method} on {found.dataset}", ""]
     rows = [["", "images", "targets", *(heads[n] for n in names)]]
-    for title, part in (("one frame per scene", found.one_frame_per_scene), ("all frames", found.all_frames)):
+    for title, part in found.parts().items():
         cells = [_percent(part.recalls[n], part.intervals.get(n)) for n in names]
         rows.append([title, str(part.images), str(part.targets), *cells])
     if found.against:
@@ -897,7 +928,8 @@ def _table(found: Score) -> str:
     lines += [
         *_columns(rows),
         "",
-        "Recalls in %; brackets: 95 % bootstrap over images. One frame per scene: the first.",
+        "Recalls in %; brackets: 95 % bootstrap over images. One frame per scene: the first."
+        + (" Without SCENE/IMAGE: its annotation is in doubt." if found.without else ""),
     ]
     if found.medians:
         parts = [
@@ -911,10 +943,13 @@ def _table(found: Score) -> str:
         )
     if found.add:
         a = found.add
-        lines.append(
+        area = (
             f"AUC to 10 cm: ADD {100 * a['add_auc']:.1f}, ADD-S {100 * a['add_s_auc']:.1f}, ADD(-S) "
-            f"{100 * a['add_or_s_auc']:.1f}; below 0.1 d: ADD(-S) {100 * a['recall_01d']:.1f} %, ADD-S "
-            f"{100 * a['add_s_01d']:.1f} %."
+            f"{100 * a['add_or_s_auc']:.1f}; below"
+        )
+        lines.append(
+            f"{area if found.all_frames.targets >= FEW else 'Below'} 0.1 d: ADD(-S) {100 * a['recall_01d']:.1f} %, "
+            f"ADD-S {100 * a['add_s_01d']:.1f} %."
         )
     if found.precision:
         p = found.precision
@@ -985,6 +1020,8 @@ def evaluate(
     metrics: Sequence[str] = ("mssd", "mspd", "vsd"),
     against: "str | Path | Score | None" = None,
     symmetric: Iterable[int] | None = None,
+    without: Iterable[tuple[int, int]] = (),
+    restart: Literal["never", "changed", "always"] = "never",
 ) -> Score:
     """Estimate every target of a data set, write the BOP result file, and score it. Kill it at any moment and call it
     again: finished images are not done twice, and the result file is the same.
@@ -992,7 +1029,9 @@ def evaluate(
     Args:
         objects: only these objects; None = all that are targets.
         estimator: ``(frame, targets) -> estimates`` for the targets of one image; an object may be left out. Seconds
-            that it counts in an attribute ``compile_seconds`` are not part of the time per image.
+            that it counts in an attribute ``compile_seconds`` are not part of the time per image; those in
+            ``shared_seconds`` (work that another estimator has done for it) are added to it; sentences in ``notes`` go
+            under the table.
         results_dir: gets ``results.jsonl`` (a line per finished image: the record that resuming trusts),
             ``METHOD_DATASET-SPLIT.csv``, ``score.json`` and ``score.txt``.
         settings: what the results depend on (configuration, weights, meshes), as plain JSON; a folder with results of
@@ -1001,7 +1040,8 @@ def evaluate(
         alignments: for objects whose estimates are of a reconstructed mesh (see `Alignment`).
         on_error: "raise" stops at a damaged file or a failing estimator; "skip" records the failure, which counts as a
             miss, and goes on.
-        metrics, against, symmetric: see `score`.
+        metrics, against, symmetric, without: see `score`.
+        restart: begin anew, forgetting what is in the folder: always, or where it was made with other settings.
 
     Raises DatasetError for damaged data, for a folder that another run is writing to, or that holds other results.
     """
@@ -1032,7 +1072,7 @@ def evaluate(
         by_image.setdefault((detection.scene_id, detection.im_id), []).append(detection)
     results = folder / f"{method.replace('_', '-')}_{dataset.name}-{dataset.split}.csv"
     with _locked(folder):
-        journal = Journal(folder / "results.jsonl", head)
+        journal = Journal(folder / "results.jsonl", head, restart)
         missing = [image for image in images if image not in journal.done]
         for image in _bar(missing, progress, "images", done=len(images) - len(missing), total=len(images)):
             try:
@@ -1044,10 +1084,10 @@ def evaluate(
                 else:
                     given = detected_targets(found, images[image])
                     before = max([d.time for d in found if d.time > 0], default=0.0)
-                start, compiling = time.perf_counter(), getattr(estimator, "compile_seconds", 0.0)
+                start, uncounted = time.perf_counter(), _uncounted(estimator)
                 estimates = list(estimator(frame, given)) if given else []
-                compiling = getattr(estimator, "compile_seconds", 0.0) - compiling
-                seconds = max(time.perf_counter() - start - compiling, 0.0) + before
+                uncounted = _uncounted(estimator) - uncounted
+                seconds = max(time.perf_counter() - start - uncounted, 0.0) + before
                 estimates = [alignments[e.obj_id].apply(e) if e.obj_id in alignments else e for e in estimates]
                 rows = [(as_row(image[0], image[1], e, seconds), float(e.scale)) for e in estimates]
                 _check_rows(rows)
@@ -1060,7 +1100,7 @@ def evaluate(
         ordered = [pair for image in images for pair in journal.done[image].rows]
         write_results(results, [row for row, _ in ordered])
         failed = [f"scene {s}, image {i}: {journal.done[s, i].error}" for s, i in images if journal.done[s, i].error]
-        notes = _alignment_notes(alignments)
+        notes = [*getattr(estimator, "notes", ()), *_alignment_notes(alignments)]
         if failed:
             notes.append(f"{len(failed)} images failed and count as misses, the first: {failed[0]}")
         found_score = score(
@@ -1074,10 +1114,15 @@ def evaluate(
             on_error=on_error,
             method=method,
             notes=notes,
+            without=without,
         )
         found_score.write_json(folder / "score.json")
         write_atomically(folder / "score.txt", found_score.table() + "\n")
     return found_score
+
+
+def _uncounted(estimator: Any) -> float:
+    return getattr(estimator, "compile_seconds", 0.0) - getattr(estimator, "shared_seconds", 0.0)
 
 
 def _differences(old: Any, new: Any, where: str = "") -> list[str]:
@@ -1100,11 +1145,15 @@ class Done:
 class Journal:
     """What has been done, a line of JSON per image, appended and flushed to disc as a whole.
 
-    A line that a crash cut short is dropped. Raises DatasetError where the file belongs to other settings.
+    A line that a crash cut short is dropped. Raises DatasetError where the file belongs to other settings and
+    ``restart`` is "never".
     """
 
-    def __init__(self, path: Path, head: Mapping[str, Any]):
+    def __init__(self, path: Path, head: Mapping[str, Any], restart: str = "never"):
         self.path = path
+        self.restart = restart
+        if restart == "always":
+            path.unlink(missing_ok=True)
         self.done: dict[tuple[int, int], Done] = {}
         head = json.loads(json.dumps(head))
         if path.is_file():
@@ -1114,9 +1163,9 @@ class Journal:
                 with open(path, "r+b") as file:
                     file.truncate(len(whole))
             lines = whole.decode("utf-8").splitlines()
-            if lines:
-                self._read(lines, head)
+            if lines and self._read(lines, head):
                 return
+            path.unlink()
         self._write(head)
 
     def append(
@@ -1127,7 +1176,8 @@ class Journal:
         self._write({"image": list(image), "seconds": seconds, "error": error, "estimates": estimates})
         self.done[image] = Done(rows, seconds, error)
 
-    def _read(self, lines: list[str], head: Mapping[str, Any]) -> None:
+    def _read(self, lines: list[str], head: Mapping[str, Any]) -> bool:
+        """Take over what was done; False where it was made otherwise and is to be forgotten."""
         differs: list[str] = []
         for number, line in enumerate(lines, start=1):
             try:
@@ -1146,10 +1196,14 @@ class Journal:
                     f"{self.path}, line {number}: damaged ({error}); delete the line to redo it"
                 ) from None
             if number == 1 and differs:
+                if self.restart == "changed":
+                    return False
                 what = ", ".join(differs[:3]) + (" …" if len(differs) > 3 else "")
                 raise DatasetError(
-                    f"{self.path}: these results were made with other settings ({what}); choose another folder"
+                    f"{self.path}: these results were made with other settings ({what}); choose another folder, or "
+                    "restart"
                 )
+        return True
 
     def _write(self, entry: Mapping[str, Any]) -> None:
         import os

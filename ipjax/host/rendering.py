@@ -163,7 +163,8 @@ def render_each(
     rotation, translation = (
         np.asarray(x, np.float64) for x in (camera_from_object.rotation, camera_from_object.translation)
     )
-    # The meshes that an image does not show shrink to the point where the one that it shows has its origin.
+    # The meshes that an image does not show shrink to the point where the one that it shows has its origin; the child
+    # leaves them out.
     poses = np.zeros((len(which), len(meshes), 3, 4))
     poses[..., 3] = translation[:, None]
     poses[np.arange(len(which)), np.asarray(which), :, :3] = rotation

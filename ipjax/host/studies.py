@@ -28,8 +28,12 @@ from ipjax.host.objects import FORMAT, load, save
 from ipjax.host.onboarding import onboard
 from ipjax.host.reports import compose
 from ipjax.host.weights import cache_folder, hash_file
+from ipjax.types import Patches, Similarity, View
 
 log = logging.getLogger("ipjax")
+
+SHARED = 512  # descriptions kept for a second configuration; about 1.5 MB each
+OWN_MAP = "the degradation's own map"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +119,7 @@ def prepare(
             added. None: the user's cache, where a file is named after all that it was made of.
         objects: only these.
         quality: 0 = the models as they are; 1–4: degraded to this level (see `degradation`) and, with a ``folder``,
-            kept in its subfolder ``quality_LEVEL``.
+            kept in its subfolder ``quality_LEVEL``; those of ``meshes`` are kept in ``meshes``.
         seed: of the degradation.
         meshes: for some objects a mesh of one's own, a reconstruction perhaps; then ``alignments`` must have the file
             of its similarity to the model (for evaluation only).
@@ -143,7 +147,9 @@ def prepare(
         source = Path(meshes[obj_id]) if obj_id in meshes else dataset.model_path(obj_id, "models")
         alignment = read_alignment(alignments[obj_id]) if obj_id in alignments else None
         key = _key(source, encoder, config, quality, seed)
-        if folder is None:
+        if folder is not None and obj_id in meshes:  # the file with its number is of the model
+            path = folder / "meshes" / f"obj_{obj_id:06d}_{key}.ipjax"
+        elif folder is None:
             path = cache_folder().parent / "objects" / f"{source.stem}_{key}.ipjax"
         else:
             path = there.get(obj_id, folder / f"obj_{obj_id:06d}.ipjax")
@@ -187,7 +193,7 @@ def _onboard(
 
 
 def _kept_alignment(path: Path) -> Alignment | None:
-    return dataclasses.replace(read_alignment(path), source="the degradation's own map") if path.is_file() else None
+    return dataclasses.replace(read_alignment(path), source=OWN_MAP) if path.is_file() else None
 
 
 def _key(source: Path, encoder: Encoder, config: OnboardConfig, quality: int, seed: int) -> str:
@@ -205,6 +211,19 @@ def _key(source: Path, encoder: Encoder, config: OnboardConfig, quality: int, se
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
 
+def hash_code() -> str:
+    """Twelve digits of the source that an estimate hangs on, so that results of another state are not continued."""
+    import ipjax_kernels
+
+    package, kernels = Path(__file__).parent.parent, Path(ipjax_kernels.__file__).parent
+    files = [p for p in package.glob("*.py") if p.stem not in ("cli", "metrics", "triposr", "__main__")]
+    files += [package / "host" / f"{name}.py" for name in ("estimation", "frames", "studies")]
+    digest = hashlib.sha256()
+    for path in [*sorted(files), *sorted(kernels.glob("*.py"))]:
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
 class Finder:
     """An estimator for `evaluation.evaluate`: every target with a mask, each object compiled for once.
 
@@ -216,6 +235,7 @@ class Finder:
         seed: same seed, same answers.
         known_size: tell the estimate the object's true diameter.
         keep: also keep the `Result` of every target in ``results``, for pictures.
+        share: keep the description of each target's crop (of the first few hundred) for those made by `beside`.
     """
 
     def __init__(
@@ -228,15 +248,36 @@ class Finder:
         seed: int = 0,
         known_size: bool = False,
         keep: bool = False,
+        share: bool = False,
     ):
         self.known = dict(known)
         self.encoder = encoder
         self.crop, self.seed, self.known_size, self.keep = crop, seed, known_size, keep
         self.estimator = Estimator([], encoder, config, crop=crop)
         self.order: dict[int, int] = {}
+        self.notes = ["the method was told each object's true size"] if known_size else []
         self.compile_seconds = 0.0  # not counted as time per image
+        self.shared_seconds = 0.0  # counted as if it had been spent here
+        self.described: dict[tuple[int, int, int, int], tuple[tuple[View, Similarity], Patches, float]] | None = (
+            {} if share else None
+        )
         self.refused: list[str] = []  # targets that could not be tried, and why
         self.results: dict[tuple[int, int, int], Result] = {}
+
+    def beside(self, config: Config) -> "Finder":
+        """The same with another configuration: objects are loaded once, and crops, whose descriptions hang on no
+        setting of the estimate, are described once where this one was made to ``share``."""
+        other = Finder(
+            self.known,
+            self.encoder,
+            config,
+            crop=self.crop,
+            seed=self.seed,
+            known_size=self.known_size,
+            keep=self.keep,
+        )
+        other.described, other.order, other.estimator.objects = self.described, self.order, self.estimator.objects
+        return other
 
     def settings(self) -> dict[str, Any]:
         """What the results depend on, as plain JSON; a resumed run must agree in it."""
@@ -246,6 +287,7 @@ class Finder:
             made[str(obj_id)] = {"mesh": info.mesh_sha256, "notes": list(info.notes), **_plain(info.config)}
         return {
             "version": __version__,
+            "code": hash_code(),
             "config": describe_config(self.estimator.config),
             "crop": self.crop,
             "seed": self.seed,
@@ -256,7 +298,7 @@ class Finder:
 
     def __call__(self, frame: Frame, targets: Sequence[Target]) -> list[Estimate]:
         found = []
-        for target in targets:
+        for number, target in enumerate(targets):
             if target.obj_id not in self.known:
                 continue
             where = f"scene {frame.scene_id}, image {frame.im_id}, object {target.obj_id}"
@@ -264,17 +306,28 @@ class Finder:
                 self.refused.append(f"{where}: no depth image")
                 continue
             index = self._index(target.obj_id)
+            key = (frame.scene_id, frame.im_id, target.obj_id, number)
+            kept = (self.described or {}).get(key)
+            start = time.perf_counter()
             try:
-                crop = self.estimator.frame(index, frame.rgb, frame.depth, target.mask, frame.camera)
+                if kept is None:
+                    crop, patches = self.estimator.frame(index, frame.rgb, frame.depth, target.mask, frame.camera), None
+                else:
+                    crop, patches, seconds = kept
+                    self.shared_seconds += seconds
             except ValueError as error:  # nothing to be seen there: a miss
                 self.refused.append(f"{where}: {error}")
                 continue
+            seconds = time.perf_counter() - start
             info = self.estimator.objects[index][1]
             alignment = self.known[target.obj_id].alignment
             unit = info.metres_per_unit or MM if alignment is None else alignment.scale
             diameter = unit / info.mesh_scale if self.known_size else None
-            result = self.estimator.run(index, *crop, seed=self.seed, diameter=diameter)
+            result = self.estimator.run(index, *crop, seed=self.seed, diameter=diameter, patches=patches)
             self.compile_seconds += result.seconds.get("compile", 0.0)
+            if self.described is not None and patches is None and len(self.described) < SHARED:
+                seconds += result.seconds["describe"]
+                self.described[key] = crop, result.query.patches, seconds
             if self.keep:
                 self.results[frame.scene_id, frame.im_id, target.obj_id] = result
             if not bool(result.estimate.success):

@@ -1,0 +1,207 @@
+"""``python -m benchmarks.evaluation DATA [DATA …]``: every method on every data set, and the page of results.
+
+In one process, for each data set in BOP layout and each quality of its meshes: `Config.paper()`, `Config()`, and the
+classical baseline where Open3D is installed, on the annotated masks. Objects are onboarded once, into the cache or the
+folder that --objects names; the methods share what was loaded and described. Results stay under --output: killed and
+called again it goes on, and results of another state of the code or of other settings are made anew. Ends with the
+page (see `benchmarks.results_page`), in Markdown and HTML.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from benchmarks import results_page
+from benchmarks.classical import INSTALL, Classical, import_open3d, read_bodies
+from ipjax.cli import _use_cache
+from ipjax.host import studies
+from ipjax.host.bop import Dataset, DatasetError, write_atomically
+from ipjax.host.evaluation import Score, evaluate
+from ipjax.host.weights import load_encoder
+
+METRICS = ("mssd", "mspd", "vsd", "add", "add_s")
+# Where a data set's own notes doubt an annotation: reported with and without.
+DOUBTFUL = {"ycbv": [(3, 138)]}
+QUALITIES = {0: "scans"} | {level: f"meshes degraded to level {level}" for level in range(1, 5)}
+
+
+def has_open3d() -> bool:
+    """Whether the classical baseline can run."""
+    try:
+        import_open3d()
+    except SystemExit:
+        return False
+    return True
+
+
+def doubtful(dataset: Dataset) -> list[tuple[int, int]]:
+    """Its target images whose annotation is known to be off."""
+    there = {(t.scene_id, t.im_id) for t in dataset.targets}
+    return [image for image in DOUBTFUL.get(dataset.name, []) if image in there]
+
+
+class Study:
+    """One data set and one set of meshes; its methods, run one after another."""
+
+    def __init__(self, title: str, dataset: Dataset, folder: Path, options: argparse.Namespace, **meshes: Any):
+        self.title, self.dataset, self.folder, self.options, self.meshes = title, dataset, folder, options, meshes
+        self._finder: studies.Finder | None = None
+
+    @property
+    def objects(self) -> list[int] | None:
+        """What is asked for; of a reconstruction, its object alone."""
+        return list(self.meshes["meshes"]) if "meshes" in self.meshes else self.options.only
+
+    def run(self, encoder: Any, methods: list[str]) -> list[Path]:
+        """The folders of results, in the order of the methods."""
+        print(f"\n== {self.title}", flush=True)
+        scores: list[Score] = []
+        folders = []
+        for method in methods:
+            start = time.perf_counter()
+            folder = self.folder / Path(method).stem
+            finder, alignments, name = self.estimator(encoder, method)
+            found = evaluate(
+                self.dataset,
+                list(alignments),
+                finder,
+                folder,
+                method=name,
+                settings=finder.settings(),
+                alignments={o: a for o, a in alignments.items() if a is not None},
+                metrics=METRICS,
+                on_error="skip",
+                progress=not self.options.quiet,
+                against=scores[0] if scores else None,
+                without=doubtful(self.dataset),
+                restart="changed",
+            )
+            scores.append(found)
+            folders.append(folder)
+            print(f"\n{found.table()}\n({time.perf_counter() - start:.0f} s)", flush=True)
+            for line in finder.refused:
+                print(f"not found: {line}")
+        return folders
+
+    def estimator(self, encoder: Any, method: str) -> tuple[Any, dict[int, Any], str]:
+        """What runs, the alignment of each object or None, and the name in the tables."""
+        seed = self.options.seed
+        if method == "classical":
+            bodies = read_bodies(self.dataset, objects=self.objects, **self.meshes)
+            return Classical(bodies, seed=seed), {o: b.alignment for o, b in bodies.items()}, "classical"
+        config = studies.read_config(method)
+        if self._finder is None:
+            known = studies.prepare(
+                self.dataset,
+                encoder,
+                folder=self.options.objects,
+                objects=self.objects,
+                progress=not self.options.quiet,
+                **self.meshes,
+            )
+            self._finder = studies.Finder(known, encoder, config, seed=seed, share=True)
+            finder = self._finder
+        else:
+            finder = self._finder.beside(config)
+        return finder, {o: k.alignment for o, k in finder.known.items()}, f"ipjax-{Path(method).stem}"
+
+
+def plan(options: argparse.Namespace) -> list[Study]:
+    """What is asked for, checked before anything takes time."""
+    datasets: dict[Path, Dataset] = {}
+    models: Path | None = options.models
+    for root in options.data:
+        own = (root / "models").is_dir()
+        if own and models is None:
+            models = root
+        if not own and models is None:
+            raise DatasetError(
+                f"{root}: it has no models; name them with --models, or name a data set with models first"
+            )
+        datasets[root] = Dataset(root, models=None if own else models)
+    found = []
+    for dataset in datasets.values():
+        for level in options.levels:
+            title = f"{dataset.name}, {QUALITIES[level]}"
+            folder = options.output / dataset.name / (f"level{level}" if level else "scans")
+            found.append(Study(title, dataset, folder, options, quality=level))
+    for root, number, mesh, alignment in options.reconstruction or ():
+        if Path(root) not in datasets:
+            raise DatasetError(f"--reconstruction {root}: name the data set itself too")
+        dataset, path = datasets[Path(root)], Path(mesh)
+        given = studies.parse_numbered([f"{number}={mesh}"], "--reconstruction")
+        aligned = studies.parse_numbered([f"{number}={alignment}"], "--reconstruction")
+        title, folder = f"{dataset.name}, object {number} from {path.name}", options.output / dataset.name / path.stem
+        found.append(Study(title, dataset, folder, options, meshes=given, alignments=aligned))
+    return found
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run what is missing, print the tables, write the page."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.evaluation", description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path, nargs="+", metavar="DATA", help="in BOP layout")
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/evaluation"), help="folder of all results")
+    parser.add_argument(
+        "--methods", nargs="+", default=["paper", "default", "auto"], metavar="paper|default|classical|FILE"
+    )
+    parser.add_argument("--levels", type=int, nargs="+", default=[0], choices=range(5), help="qualities of the meshes")
+    parser.add_argument(
+        "--reconstruction",
+        nargs=4,
+        action="append",
+        metavar=("DATA", "N", "MESH", "JSON"),
+        help="a reconstructed mesh of object N and its similarity to the model (for evaluation only)",
+    )
+    parser.add_argument(
+        "--models", type=Path, help="for data sets without: another one (default: the first with models)"
+    )
+    parser.add_argument(
+        "--objects", type=Path, help="folder of object files; missing ones are added (default: the cache)"
+    )
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only these objects")
+    parser.add_argument("--weights", help="of the encoder (default: the best that is here)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    parser.add_argument("--page", type=Path, default=Path("out/accuracy"), help="the page, without .md, .html")
+    options = parser.parse_args(arguments)
+    methods = [m for m in options.methods if m != "auto"]
+    if "auto" in options.methods and has_open3d():
+        methods.append("classical")
+    elif "auto" in options.methods:
+        print(f"left out: {INSTALL}")
+    elif "classical" in methods and not has_open3d():
+        raise SystemExit(INSTALL)
+    start = time.perf_counter()
+    try:
+        planned = plan(options)
+        for method in methods:
+            if method != "classical":
+                studies.read_config(method)
+        _use_cache()
+        encoder = None
+        if any(method != "classical" for method in methods):
+            encoder = load_encoder(options.weights)
+            print(f"encoder: {encoder.identity}")
+        manifest = []
+        for study in planned:
+            folders = study.run(encoder, methods)
+            manifest.append(
+                {
+                    "title": study.title,
+                    "data": str(study.dataset.root),
+                    "models": str(study.dataset.models_root),
+                    "runs": [str(folder) for folder in folders],
+                }
+            )
+            study._finder = None  # its templates are large
+        write_atomically(options.output / "studies.json", json.dumps(manifest, indent=1))
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
+    results_page.write(results_page.read_studies(options.output / "studies.json"), options.page)
+    print(f"{time.perf_counter() - start:.0f} s in all")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""Runs ``ipjax`` or ``python -m benchmarks.evaluation`` with the stand-in encoder of `problems`; started by tests.
+
+Arguments: seconds that each image takes longer (so that there is time to be killed in), then "ipjax" or "benchmark",
+then the command's own.
+"""
+
+import sys
+import time
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+
+import equinox as eqx  # noqa: E402
+from problems import CoordinateEncoder, make_encoder  # noqa: E402
+
+import ipjax.cli  # noqa: E402
+import ipjax.host.weights  # noqa: E402
+from ipjax.host import studies  # noqa: E402
+
+
+class Named(CoordinateEncoder):
+    """The encoder with an identity, as object files want it."""
+
+    identity: str = eqx.field(static=True, default="coordinates")
+
+
+plain = make_encoder()
+encoder = Named(plain.frequencies, plain.phases)
+ipjax.cli._load_encoder = lambda arguments: encoder
+ipjax.host.weights.load_encoder = lambda *_, **__: encoder
+estimate = studies.Finder.__call__
+
+
+def slowly(finder, frame, targets):
+    time.sleep(float(sys.argv[1]))
+    return estimate(finder, frame, targets)
+
+
+studies.Finder.__call__ = slowly
+if sys.argv[2] == "ipjax":
+    sys.exit(ipjax.cli.main(sys.argv[3:]))
+from benchmarks import evaluation  # noqa: E402
+
+made: list[studies.Finder] = []
+beside = studies.Finder.beside
+studies.Finder.beside = lambda finder, config: (made.append(beside(finder, config)), made[-1])[1]
+evaluation.main(sys.argv[3:])
+print("shared:", all(finder.shared_seconds > 0 for finder in made), len(made))
