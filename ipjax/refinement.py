@@ -122,9 +122,10 @@ def _residuals(moved, points, normals, trust, cloud, config):
     beside = _beside(placed, cloud.outline[row, column], moved.scale, cloud.camera, config)
     on_mask = cloud.mask[row, column] & inside
     forward = jnp.where(on_mask, forward, beside) * jnp.sqrt(trust)
-    # Surface that faces away, or lies behind an occluder, cannot have been measured and costs nothing.
+    # Surface that faces away, lies behind an occluder, or falls into a hole of the depth image cannot have been
+    # measured and costs nothing.
     nearer = (cloud.depth[row, column] > 0) & (cloud.depth[row, column] < placed[:, 2] - config.reach * moved.scale / 2)
-    counted = visible & ~lax.stop_gradient(nearer & ~on_mask)
+    counted = visible & ~lax.stop_gradient(jnp.where(on_mask, ~measured, nearer))
     forward = jnp.where(counted, forward, 0)
     targets = cloud.points[::2, ::2].reshape(-1, 3)
     known = cloud.valid[::2, ::2].reshape(-1)
@@ -148,11 +149,11 @@ def _cells(placed, cloud):
 
 
 def _beside(placed, outline, scale, camera, config):
-    """Geman–McClure on the sideways distance to the mask's outline, half a cell of it free, on top of a fixed share:
+    """Geman–McClure on the sideways distance to the mask's outline, a cell's own reach of it free, on top of a fixed share:
     leaving the mask must cost more than fitting badly inside it."""
     offset = project(camera, placed) - outline.astype(placed.dtype)
     apart = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
-    metres = jnp.maximum(apart - 0.5, 0) * placed[:, 2] / jnp.mean(camera.focal)
+    metres = jnp.maximum(apart - 0.75, 0) * placed[:, 2] / jnp.mean(camera.focal)
     squared = (metres / (config.outline_width * scale)) ** 2
     return jnp.sqrt(0.8 + 0.2 * squared / (1 + squared))
 
