@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.measure import describe_device
 from ipjax.config import MatchConfig
-from ipjax.features import centre_on, describe
+from ipjax.features import cut, describe, object_features, principal_basis
 from ipjax.host.bop import Dataset
 from ipjax.host.estimation import Estimator
 from ipjax.host.objects import compact, load
@@ -47,23 +47,14 @@ def queries(dataset: Dataset, folder: Path, encoder, most: int):
             if target is not None:
                 view, _ = estimator.frame(0, frame.rgb, frame.depth, target.mask, frame.camera)
                 patches = see(encoder, view)
-                found.append(eqx.tree_at(lambda p: p.features, patches, centre_on(patches.features, templates.mean)[0]))
+                found.append(eqx.tree_at(lambda p: p.features, patches, object_features(patches.features, templates)))
         yield obj_id, compact(templates), found
 
 
-def principal(templates: Templates, count: int) -> np.ndarray:
-    """The ``count`` strongest principal directions of an object's valid features, columns; largest entry positive."""
-    features = np.asarray(templates.patches.features, np.float32)[np.asarray(templates.patches.valid)]
-    _, vectors = np.linalg.eigh(features.T.astype(np.float64) @ features)
-    basis = vectors[:, ::-1][:, :count]
-    return (basis * np.sign(basis[np.abs(basis).argmax(axis=0), np.arange(count)])).astype(np.float32)
-
-
 def project(patches: Patches, basis: np.ndarray) -> Patches:
-    """Unit vectors of the features' components along the basis."""
-    short = np.asarray(patches.features, np.float32) @ basis
-    short = short / np.maximum(np.linalg.norm(short, axis=-1, keepdims=True), 1e-9)
-    return eqx.tree_at(lambda p: p.features, patches, jnp.asarray(short, patches.features.dtype))
+    """The patches with features cut to a basis."""
+    short = cut(patches.features, jnp.asarray(basis))[0]
+    return eqx.tree_at(lambda p: p.features, patches, short.astype(patches.features.dtype))
 
 
 def compare(templates: Templates, query: Patches, other: tuple[Templates, Patches], run, run_other) -> dict[str, float]:
@@ -108,7 +99,7 @@ def main() -> None:
     found: dict[tuple[str, int], list[dict[str, float]]] = {}
     for obj_id, templates, crops in queries(Dataset(options.data), options.objects, encoder, options.most):
         print(f"object {obj_id}: {len(crops)} crops, {templates.norm.shape[1]} patches a template", flush=True)
-        bases = {n: principal(templates, n) for n in options.channels}
+        bases = {n: principal_basis(templates.patches, n) for n in options.channels}
         cut = {n: eqx.tree_at(lambda t: t.patches, templates, project(templates.patches, b)) for n, b in bases.items()}
         for query in crops:
             for n, run_short in short.items():

@@ -162,6 +162,7 @@ inflated, or its depth completed. The report shows what was seen and what was gu
     parser.add_argument("--unit", choices=tuple(_UNITS), help="of the mesh file, if known; never guessed")
     parser.add_argument("--directions", type=_positive, metavar="N", help="viewpoints on the sphere (default 40)")
     parser.add_argument("--rolls", type=_positive, metavar="N", help="in-plane rotations of each (default 10)")
+    parser.add_argument("--channels", type=_positive, metavar="N", help="cut features to N principal directions")
     parser.add_argument("--backend", default="auto", help="renderer: auto, egl, osmesa, native or raster")
     _add_encoder(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress bars, no notes")
@@ -198,7 +199,9 @@ def _onboard(arguments: argparse.Namespace) -> int:
         _check_output(arguments.save_mesh, (".glb", ".obj", ".ply", ".stl"))
     from ipjax.config import OnboardConfig
 
-    config = OnboardConfig(**{k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None})
+    config = OnboardConfig(
+        **{k: v for k in ("directions", "rolls", "channels") if (v := getattr(arguments, k)) is not None}
+    )
     start = time.perf_counter()
     options: dict[str, Any] = {
         "out": output,

@@ -106,5 +106,6 @@ class OnboardConfig(eqx.Module):
     fill: float = _static(0.83)  # share of the image that the object's box takes: 20 % of padding around it
     distance: float = _static(3.0)  # diameters from the camera to the object's centre
     surface: int = _static(2048)  # points sampled on the surface
+    channels: int = _static(0)  # principal directions that features are cut to; 0 = whole features
     appearance: int = _static(65536)  # coloured points to draw candidates from; 0 = none
     describe: DescribeConfig = DescribeConfig()

@@ -3,11 +3,12 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import point_map
 from ipjax.config import DescribeConfig
-from ipjax.types import Patches, Query, View
+from ipjax.types import Patches, Query, Templates, View
 
 
 def describe(
@@ -72,6 +73,38 @@ def centre(
     mean = jnp.sum(raw * share, axis=(0, 1)) / jnp.maximum(jnp.sum(share), 1)
     features, norm = centre_on(raw, mean)
     return Patches(features.astype(patches.features.dtype), patches.points, patches.grid, patches.valid), mean, norm
+
+
+def principal_basis(patches: Patches, count: int) -> Float[np.ndarray, "f c"]:
+    """The ``count`` strongest principal directions of an object's centred features (of its valid patches), as rows.
+
+    On the host, once per object. The largest entry of each row is positive, so that the same features give the same
+    basis everywhere.
+
+    Raises:
+      ValueError: ``count`` is not between 1 and the number of channels.
+    """
+    channels = patches.features.shape[-1]
+    if not 1 <= count <= channels:
+        raise ValueError(f"features of {channels} channels cannot be cut to {count}")
+    features = np.asarray(patches.features, np.float64)[np.asarray(patches.valid)]
+    _, vectors = np.linalg.eigh(features.T @ features)
+    basis = vectors[:, ::-1][:, :count].T
+    sign = np.sign(basis[np.arange(count), np.abs(basis).argmax(axis=1)])
+    return (basis * sign[:, None]).astype(np.float32)
+
+
+def cut(features: Float[Array, "*b c"], basis: Float[Array, "f c"]) -> tuple[Float[Array, "*b f"], Float[Array, "*b"]]:
+    """Unit vectors of the components of features along the rows of a basis, and their norms."""
+    short = jnp.matmul(features.astype(basis.dtype), basis.T, precision="highest")
+    norm = jnp.sqrt(jnp.sum(short * short, axis=-1))
+    return short / jnp.maximum(norm, 1e-9)[..., None], norm
+
+
+def object_features(features: Float[Array, "*b c"], templates: Templates) -> Float[Array, "*b f"]:
+    """An encoder's raw features as the templates hold theirs: without the object's mean, cut to its basis."""
+    rest = centre_on(features, templates.mean)[0]
+    return rest if templates.basis is None else cut(rest, templates.basis)[0]
 
 
 def centre_on(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ipjax.alignment import align
 from ipjax.config import Config
-from ipjax.features import centre_on, lift
+from ipjax.features import lift, object_features
 from ipjax.matching import match, select
 from ipjax.refinement import Cloud, nearest_inside, refine
 from ipjax.scoring import depth_agreement, drawn_agreement, feature_agreement, score
@@ -51,7 +51,7 @@ def estimate(
         matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
     # From here on the query's features are centred, as the templates' are.
-    query = eqx.tree_at(lambda q: q.patches.features, query, centre_on(query.patches.features, templates.mean)[0])
+    query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
         poses, agreement, _, determined = align(pairs, size, key, config.align, diameter=diameter)
@@ -195,13 +195,11 @@ def _draw_best(
     agreement = jnp.where(determined, agreement, -1)
     chosen, ahead = distinct(poses, agreement, min(config.score.drawn, agreement.shape[0]), config.score.apart)
     poses, parent, determined, _ = jax.tree.map(lambda x: x[chosen], found)
-    appearance = templates.appearance
-    assert appearance is not None
 
     def rate(pose):
         depth = depth_agreement(templates.surface, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
         features = feature_agreement(templates, query, pose, config.score)
-        return depth * features * drawn_agreement(encoder, appearance, templates.mean, query, pose, config.score)
+        return depth * features * drawn_agreement(encoder, templates, query, pose, config.score)
 
     with jax.named_scope("draw"):
         # One image at a time is fastest on a CPU; accelerators want them all.
@@ -256,9 +254,12 @@ def comparable(templates: Templates, query: Patches, config: Config = Config()) 
       query: as described, raw.
     """
     if config.match.centred:
-        features = centre_on(query.features, templates.mean)[0]
+        features = object_features(query.features, templates)
         return eqx.tree_at(lambda q: q.features, query, features), templates
-    raw = templates.patches.features.astype(templates.mean.dtype) * templates.norm[..., None] + templates.mean
+    raw = templates.patches.features.astype(templates.mean.dtype) * templates.norm[..., None]
+    if templates.basis is not None:
+        raw = jnp.matmul(raw, templates.basis, precision="highest")
+    raw = raw + templates.mean
     return query, eqx.tree_at(lambda t: t.patches.features, templates, raw)
 
 

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import project
 from ipjax.config import ScoreConfig
-from ipjax.features import centre_on
-from ipjax.types import Appearance, Camera, Patches, Query, Similarity, Surface, Templates
+from ipjax.features import object_features
+from ipjax.types import Camera, Patches, Query, Similarity, Surface, Templates
 
 
 def score(
@@ -111,8 +111,7 @@ def feature_agreement(
 
 def drawn_agreement(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
-    appearance: Appearance,
-    mean: Float[Array, "c"],
+    templates: Templates,
     query: Query,
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
@@ -123,9 +122,15 @@ def drawn_agreement(
     what of the mask is left empty, counts as zero. What an occluder hides is not drawn.
 
     Args:
-      mean: of the object's features; the query's are centred on it already.
+      templates: of the object, with its appearance.
+      query: its patches centred on the templates' mean, as the templates' are.
+
+    Raises:
+      ValueError: the templates have no appearance.
     """
-    view = query.view
+    appearance, view = templates.appearance, query.view
+    if appearance is None:
+        raise ValueError("these templates have no appearance to draw: onboard the object with appearance > 0")
     height, width = view.depth.shape
     placed = camera_from_object @ appearance.points
     normals = jnp.sum(camera_from_object.rotation[None] * appearance.normals[:, None, :], axis=-1)
@@ -136,7 +141,7 @@ def drawn_agreement(
     )
     hidden = ~view.mask & (view.depth > 0) & (view.depth < depth - tolerance)
     shown = (depth > 0) & ~hidden
-    features = centre_on(encoder(jnp.where(shown[..., None], image, 0)), mean)[0]
+    features = object_features(encoder(jnp.where(shown[..., None], image, 0)), templates)
     rows, columns, _ = features.shape
     share = lambda pixels: jnp.mean(
         pixels.astype(depth.dtype).reshape(rows, height // rows, columns, width // columns), axis=(1, 3)

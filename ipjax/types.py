@@ -74,16 +74,15 @@ class Templates(eqx.Module):
 
     patches: Patches  # leading axes *b v; features centred: see ``ipjax.features.centre``
     mean: Float[Array, "*b c"]  # of the object's features, taken out of every one of them
-    norm: Float[Array, "*b v p"]  # what was left of each; raw feature = norm · feature + mean
+    norm: Float[Array, "*b v p"]  # what was left of each; raw feature = norm · feature (@ basis) + mean
     seen: Float[Array, "*b v p"]  # how much of the patch's surface was seen (1) or guessed (0)
     camera_from_object: Similarity  # leading axes *b v; scale 1, model units
     camera: Camera  # of each template, leading axes *b v; pixels of the rendered image
     surface: Surface
     extents: Float[Array, "*b 3"]  # sides of the axis-aligned bounding box, model units
     axes: Float[Array, "*b 3 3"]  # rows: unit axes of the smallest box around the object, about which it may look alike
-    appearance: Appearance | None = (
-        None  # with it and the encoder, candidates are drawn and compared; None = they are not
-    )
+    basis: Float[Array, "*b f c"] | None = None  # rows: the principal directions that features were cut to
+    appearance: Appearance | None = None  # with it and the encoder, candidates are drawn and compared
 
 
 class Query(eqx.Module):

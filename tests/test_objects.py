@@ -95,6 +95,19 @@ def test_the_appearance_comes_back_to_the_digits_of_its_file(tmp_path):
     np.testing.assert_allclose(again.appearance.colours, look.colours, atol=0.5 / 255 + 1e-6)
 
 
+def test_a_basis_comes_back_and_must_fit(tmp_path):
+    templates, info = make_object()
+    channels = templates.mean.shape[0]
+    short = dataclasses.replace(templates.patches, features=templates.patches.features[..., :3])
+    cut = dataclasses.replace(templates, patches=short, basis=jnp.eye(3, channels))
+    again, _ = load(save(tmp_path / "cut.ipjax", cut, info))
+    np.testing.assert_array_equal(again.basis, cut.basis)
+    np.testing.assert_array_equal(again.patches.features, short.features)
+    with pytest.raises(ValueError, match="have no basis"):
+        save(tmp_path / "bad.ipjax", dataclasses.replace(cut, basis=None), info)
+    assert not (tmp_path / "bad.ipjax").exists()
+
+
 def test_a_loaded_object_can_be_saved_again(file, tmp_path):
     templates, info = load(file)
     save(tmp_path / "again.ipjax", templates, info)

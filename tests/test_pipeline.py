@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 import ipjax
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
-from ipjax.pipeline import distinct
+from ipjax.features import cut, principal_basis
+from ipjax.pipeline import comparable, distinct
 from ipjax.types import Query, Similarity
 
 TINY = Config(
@@ -216,3 +217,53 @@ def test_distinct_poses_are_the_greedy_choice(seed):
         if score[i] >= 0 and not any(near) and len(expected) < 6:
             expected.append(int(i))
     assert np.asarray(chosen)[np.asarray(there)].tolist() == expected
+
+
+def shorten(templates, count: int):
+    """The templates with features cut to `count` principal directions, as onboarding does it."""
+    basis = jnp.asarray(principal_basis(templates.patches, count))
+    features, kept = cut(templates.patches.features, basis)
+    patches = dataclasses.replace(templates.patches, features=features)
+    return dataclasses.replace(templates, patches=patches, norm=templates.norm * kept, basis=basis)
+
+
+def test_principal_directions_are_the_strongest_and_canonical(templates):
+    features = np.asarray(templates.patches.features, np.float64)[np.asarray(templates.patches.valid)]
+    basis = principal_basis(templates.patches, 7)
+    np.testing.assert_allclose(basis @ basis.T, np.eye(7), atol=1e-5)
+    assert (basis[np.arange(7), np.abs(basis).argmax(1)] > 0).all()
+    _, values, _ = np.linalg.svd(features, full_matrices=False)
+    np.testing.assert_allclose(((features @ basis.T.astype(np.float64)) ** 2).sum(0), values[:7] ** 2, rtol=1e-4)
+    with pytest.raises(ValueError, match="cannot be cut to 0"):
+        principal_basis(templates.patches, 0)
+    with pytest.raises(ValueError, match="cannot be cut to 33"):
+        principal_basis(templates.patches, 33)
+
+
+def test_all_principal_directions_lose_nothing(templates):
+    query, _ = problems.make_query(3)
+    whole = shorten(templates, 32)
+    for config in (Config(), Config.paper()):
+        mine, known = comparable(whole, query.patches, config)
+        theirs, wanted = comparable(templates, query.patches, config)
+        valid = np.asarray(templates.patches.valid)
+        products = lambda q, t: np.einsum("pc,vqc->vpq", q.features, t.patches.features)[:, np.asarray(q.valid)]
+        np.testing.assert_allclose(
+            products(mine, known).swapaxes(1, 2)[valid], products(theirs, wanted).swapaxes(1, 2)[valid], atol=1e-4
+        )
+
+
+def test_fewer_channels_still_recover_pose_and_size(templates):
+    """Sixteen of thirty-two: the answer is nearly the same, and features of either length are told apart."""
+    short = shorten(templates, 16)
+    assert short.patches.features.shape[-1] == 16
+    for seed in range(3):
+        query, truth = problems.make_query(seed)
+        found = estimate(short, query, jax.random.key(0), TINY)
+        assert bool(found.success)
+        offset = found.camera_from_object.translation - truth.translation
+        assert float(jnp.linalg.norm(offset)) < 0.15 * float(truth.scale)
+        assert abs(float(found.camera_from_object.scale / truth.scale) - 1) < 0.15
+    with pytest.raises(ValueError, match="16 channels"):
+        query, _ = problems.make_query(0, channels=16)
+        ipjax.estimate(short, query, jax.random.key(0), TINY)

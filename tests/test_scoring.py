@@ -1,5 +1,7 @@
 """Scores prefer the truth, ignore occluders, and stay in [0, 1]."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -100,11 +102,11 @@ def test_nothing_seen_scores_nothing(templates, case):
 def drawn(case):
     """The score of a pose by what it looks like, and of one behind an occluder over the left half."""
     query, *_ = case
-    encoder, appearance = problems.make_encoder(), problems.make_appearance(20_000)
-    mean = jnp.zeros(query.patches.features.shape[-1])
+    encoder = problems.make_encoder()
+    known = dataclasses.replace(problems.make_templates(), appearance=problems.make_appearance(20_000))
 
     def rate(pose, query=query):
-        return float(drawn_score(encoder, appearance, mean, query, pose, CONFIG))
+        return float(drawn_score(encoder, known, query, pose, CONFIG))
 
     return rate
 
@@ -140,3 +142,9 @@ def test_out_of_sight_looks_like_nothing(case, drawn):
     *_, truth = case
     away = retract(truth, jnp.array([0, 0, 0, 50.0, 0, 0, 0], jnp.float32))
     assert drawn(away) == 0
+
+
+def test_nothing_to_draw_is_said(templates, case):
+    query, *_, truth = case
+    with pytest.raises(ValueError, match="no appearance to draw"):
+        drawn_agreement(problems.make_encoder(), templates, query, truth)

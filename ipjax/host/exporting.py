@@ -47,6 +47,7 @@ def _to_templates(tree: dict[str, Any]) -> Templates:
         camera=Camera(**tree["camera"]),
         surface=Surface(**tree["surface"]),
         **{name: tree[name] for name in ("mean", "norm", "seen", "extents", "axes")},
+        basis=tree.get("basis"),
     )
 
 
@@ -58,7 +59,7 @@ def _to_query(tree: dict[str, Any]) -> Query:
 
 def blank_query(templates: Templates, resolution: int) -> Query:
     """A query of the shapes that go with the templates, of zeros: square crops of ``resolution`` pixels."""
-    *_, patches, channels = templates.patches.features.shape
+    patches, channels = templates.norm.shape[-1], templates.mean.shape[-1]
     zeros = lambda *shape: jnp.zeros(shape, jnp.float32)
     square = (resolution, resolution)
     return Query(

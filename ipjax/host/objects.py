@@ -4,7 +4,7 @@ Layout: one safetensors file (https://github.com/huggingface/safetensors). Its m
 key ``ipjax``: format version, who the object and the encoder are, how the normalised object frame lies in the user's
 mesh, and a checksum. Tensors, for v templates of p patches with c channels:
 
-    features f16 [v p c] · mean f32 [c] · norm f32 [v p]
+    features f16 [v p f] · mean f32 [c] · norm f32 [v p] · basis f32 [f c]          without the optional basis f = c
     points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
     rotation f32 [v 3 3] · translation f32 [v 3] · focal, centre f32 [v 2]           camera_from_object and its camera
     surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3] · axes f32 [3 3]
@@ -35,7 +35,7 @@ SUFFIX = ".ipjax"
 _PICTURE = 160  # pixels, longest side of a stored template image
 
 _TEMPLATE_TENSORS = {
-    "features": ("float16", "vpc"),
+    "features": ("float16", "vpf"),
     "points": ("float32", "vp3"),
     "grid": ("float32", "vp2"),
     "valid": ("bool", "vp"),
@@ -53,6 +53,7 @@ _TEMPLATE_TENSORS = {
     "axes": ("float32", "33"),
 }
 _OPTIONAL_TENSORS = {
+    "basis": ("float32", "fc"),
     "appearance.points": ("float16", "m3"),
     "appearance.normals": ("float16", "m3"),
     "appearance.colours": ("uint8", "m3"),
@@ -235,6 +236,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         "extents": templates.extents,
         "axes": templates.axes,
     }
+    if templates.basis is not None:
+        tensors["basis"] = templates.basis
     if templates.appearance is not None:
         tensors |= {
             "appearance.points": templates.appearance.points,
@@ -363,6 +366,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
             ),
             extents=device["extents"],
             axes=device["axes"],
+            basis=jnp.asarray(tensors["basis"]) if "basis" in tensors else None,
             appearance=_appearance(tensors),
         ),
         info,
@@ -454,6 +458,9 @@ def _check_shapes(found: dict[str, tuple[str, tuple[int, ...]]], where: str) -> 
                 fits = fits and length == expected and (length > 0 or letter in "abij")
         if not fits:
             raise ValueError(f"{where}: not a usable object: {name} is {dtype} {list(shape)}")
+    if "basis" not in found and lengths["f"] != lengths["c"]:
+        shape = list(found["features"][1])
+        raise ValueError(f"{where}: not a usable object: features {shape} have no basis and a mean of {lengths['c']}")
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
-from ipjax.features import centre, describe
+from ipjax.features import centre, cut, describe, principal_basis
 from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_appearance, sample_surface, sample_texture
 from ipjax.host.objects import ObjectInfo, save
 from ipjax.host.rendering import render
@@ -92,8 +92,15 @@ def make_templates(
         patches.append(one)
         seen.append(sure)
     patches, mean, norm = jax.jit(centre)(jax.tree.map(lambda *x: jnp.stack(x), *patches))
+    basis = None
+    if config.channels:
+        basis = jnp.asarray(principal_basis(patches, config.channels))
+        features, kept = jax.jit(cut)(patches.features, basis)
+        patches = dataclasses.replace(patches, features=features.astype(patches.features.dtype))
+        norm = norm * kept
     templates = Templates(
         patches=patches,
+        basis=basis,
         mean=mean,
         norm=norm,
         seen=jnp.stack(seen),
