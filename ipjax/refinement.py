@@ -149,8 +149,10 @@ def _cells(placed, cloud):
 
 
 def _beside(placed, outline, scale, camera, config):
-    """Geman–McClure on the sideways distance to the mask's outline, a cell's own reach of it free, on top of a fixed share:
-    leaving the mask must cost more than fitting badly inside it."""
+    """Geman–McClure on the sideways distance to the mask's outline, a cell's own reach of it free.
+
+    On top of a fixed share: leaving the mask must cost more than fitting badly inside it.
+    """
     offset = project(camera, placed) - outline.astype(placed.dtype)
     apart = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
     metres = jnp.maximum(apart - 0.75, 0) * placed[:, 2] / jnp.mean(camera.focal)

@@ -32,6 +32,7 @@ LAYERS = {
 }
 MAY_SHARE = {  # modules of one layer that may import their neighbours, and why
     "ipjax.triposr": {"ipjax.dinov2"},  # two vision transformers of one family share their blocks
+    "ipjax.scoring": {"ipjax.features"},  # what it draws is described as the templates were
 }
 HEAVY = {"mujoco", "cv2", "trimesh", "torch", "scipy", "skimage", "PIL", "matplotlib", "safetensors", "tqdm"}
 OF_KERNELS = {"jax", "jaxtyping", "numpy", "ipjax_kernels", *sys.stdlib_module_names}
