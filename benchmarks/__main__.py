@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from benchmarks.measure import describe_device
+from benchmarks.results_page import commit
 from benchmarks.table import render
 
 
@@ -39,7 +40,8 @@ def main():
         print(*sorted(options.trace.rglob("*.json.gz")))
         return
     begin = time.perf_counter()
-    results = {**describe_device(), "date": time.strftime("%Y-%m-%d"), "quick": options.quick, "rows": []}
+    results = {**describe_device(), "date": time.strftime("%Y-%m-%d"), "commit": commit()}
+    results |= {"quick": options.quick, "rows": []}
     for name, rows in available.items():
         if options.only and name not in options.only:
             continue

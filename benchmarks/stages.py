@@ -104,13 +104,13 @@ def hypotheses(templates, query, key):
 
 def refine_all(templates, query, poses, config):
     """Every hypothesis fitted to the depth."""
-    cloud = Scene(query, config.score.resolution).cloud
+    cloud = Scene(query, config.score.resolution, config.refine.silhouette).cloud
     return jax.vmap(lambda pose: refine(templates.surface, cloud, pose, config.refine)[0])(poses)
 
 
 def score_all(templates, query, poses, config):
     """Every hypothesis compared with the depth and the features."""
-    scene = Scene(query, config.score.resolution)
+    scene = Scene(query, config.score.resolution, config.refine.silhouette)
     rate = lambda pose: score(templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
     return jax.vmap(rate)(poses)
 

@@ -29,7 +29,8 @@ def render(results: dict) -> str:
     """One device's results as a heading and a table."""
     lines = [
         f"**{results['device']}** ({results['platform']}, {results['cores']} cores), jax {results['jax']}, "
-        f"Python {results['python']}, {results['date']}" + (" — quick run, small sizes" if results["quick"] else ""),
+        f"Python {results['python']}, {results['date']}, commit {results.get('commit', 'unknown')}"
+        + (" — quick run, small sizes" if results["quick"] else ""),
         "",
         "| " + " | ".join(COLUMNS) + " |",
         "|" + " --- |" * len(COLUMNS),

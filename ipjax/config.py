@@ -49,10 +49,13 @@ class RefineConfig(eqx.Module):
     """From a coarse similarity to one that fits the depth image."""
 
     steps: int = _static(12)  # of Levenberg and Marquardt; 0 = no refinement, as in the paper
-    points: int = _static(384)  # surface points per direction of the association
+    points: int = _static(256)  # surface points per direction of the association
     reach: float = 0.06  # associations farther than this are dropped, in diameters
-    width: float = 0.01  # of the robust loss, in diameters
-    outline_width: float = 0.03  # of the loss on what projects beside the mask, in diameters
+    width: float = 0.03  # of the robust loss, in diameters
+    silhouette: int = _static(96)  # points on the mask's border that the silhouette is fitted to
+    silhouette_reach: float = 0.1  # silhouettes farther from the border than this are dropped, in diameters
+    silhouette_width: float = 0.02  # of the robust loss on the distance between them, in diameters
+    silhouette_weight: float = 1.6  # beside 1 for each direction of the depth association
 
 
 class ScoreConfig(eqx.Module):

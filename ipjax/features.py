@@ -84,14 +84,18 @@ def principal_basis(patches: Patches, count: int) -> Float[np.ndarray, "f c"]:
     Raises:
       ValueError: ``count`` is not between 1 and the number of channels.
     """
-    channels = patches.features.shape[-1]
-    if not 1 <= count <= channels:
-        raise ValueError(f"features of {channels} channels cannot be cut to {count}")
+    check_cut(patches.features.shape[-1], count)
     features = np.asarray(patches.features, np.float64)[np.asarray(patches.valid)]
     _, vectors = np.linalg.eigh(features.T @ features)
     basis = vectors[:, ::-1][:, :count].T
     sign = np.sign(basis[np.arange(count), np.abs(basis).argmax(axis=1)])
     return (basis * sign[:, None]).astype(np.float32)
+
+
+def check_cut(channels: int, count: int) -> None:
+    """Raise ValueError unless features of so many channels can be cut to ``count``."""
+    if not 1 <= count <= channels:
+        raise ValueError(f"features of {channels} channels cannot be cut to {count}")
 
 
 def cut(features: Float[Array, "*b c"], basis: Float[Array, "f c"]) -> tuple[Float[Array, "*b f"], Float[Array, "*b"]]:

@@ -13,7 +13,7 @@ from ipjax.alignment import align
 from ipjax.config import Config
 from ipjax.features import lift, object_features
 from ipjax.matching import match, select
-from ipjax.refinement import Cloud, nearest_inside, refine
+from ipjax.refinement import Cloud, refine, trace_contour
 from ipjax.scoring import depth_agreement, drawn_agreement, feature_agreement, score
 from ipjax.types import Camera, Hypotheses, Patches, PoseEstimate, Query, Similarity, Templates
 
@@ -57,7 +57,7 @@ def estimate(
         poses, agreement, _, determined = align(pairs, size, key, config.align, diameter=diameter)
     parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
     if config.score.ranking == "render":
-        scene = _Scene(query, config.score.resolution)
+        scene = _Scene(query, config.score.resolution, config.refine.silhouette)
         poses, parent, determined, agreement = _rounds(
             templates, query, scene, (poses, parent, determined), config, scale_known=diameter is not None
         )
@@ -104,7 +104,7 @@ class _Scene(eqx.Module):
     depth: Float[Array, "g g"]  # background included: it shows what occludes
     mask: Bool[Array, "g g"]
 
-    def __init__(self, query: Query, grid: int):
+    def __init__(self, query: Query, grid: int, contour: int):
         side = query.view.depth.shape[0]
         cell = side / grid
         points, cover = lift(query.view, grid, grid, 0.05)
@@ -118,8 +118,13 @@ class _Scene(eqx.Module):
             camera,
             self.mask,
             self.depth,
-            nearest_inside(self.mask),
+            trace_contour(self.mask, self.depth, 0.1 * _extent(self.mask, self.depth, camera), contour),
         )
+
+
+def _extent(mask: Bool[Array, "h w"], depth: Float[Array, "h w"], camera: Camera) -> Float[Array, ""]:
+    """The root of the area that the mask covers, metres: how large things are here, roughly."""
+    return jnp.sqrt(jnp.sum(jnp.where(mask, depth, 0) ** 2) / (camera.focal[0] * camera.focal[1]))
 
 
 def _rounds(

@@ -1,23 +1,78 @@
 """From a coarse similarity to one that fits the depth image: robust least squares on Sim(3) or SE(3).
 
 Both directions are associated: surface points with the depth they project to, and depth points with their nearest
-surface point. One direction alone lets a free scale shrink or grow the object along the rays. Surface that projects
-beside the mask is drawn to its outline, unless something hides it there.
+surface point. One direction alone lets a free scale shrink or grow the object along the rays. The object's silhouette
+is fitted to the mask's border, which fixes the size that depth leaves loose; surface that projects beside the mask
+costs as much as a point can. Neither counts where something hides the object.
 """
 
+import functools
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import lineax as lx
+import numpy as np
 import optimistix as optx
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import project
 from ipjax.config import RefineConfig
 from ipjax.types import Camera, Similarity, Surface
+
+
+class Contour(eqx.Module):
+    """Points on the mask's border where nothing hides the object, in cells of the grid."""
+
+    points: Float[Array, "b 2"]  # (column, row)
+    outward: Float[Array, "b 2"]  # unit normals
+    valid: Bool[Array, "b"]
+
+
+def trace_contour(
+    mask: Bool[Array, "h w"], depth: Float[Array, "h w"], nearer: Float[Array, ""] | float, count: int
+) -> Contour:
+    """About ``count`` points spread over the border between a mask and what lies around it.
+
+    Args:
+      depth: metres, 0 = unknown. What is by ``nearer`` before the mask's depth beside it cuts the object: the border
+        is its own there, and left out, as is the border of the image.
+      count: where the whole border is shorter, the remaining points are not valid.
+    """
+    height, width = mask.shape
+    reach = 2  # cells that the normals are smoothed over, and that occluders are looked for in
+
+    def window(image, radius, combine, beyond):
+        """Combine each cell's square neighbourhood, rows first."""
+        padded = jnp.pad(image, radius, constant_values=beyond)
+        rows = functools.reduce(combine, [padded[i : i + height] for i in range(2 * radius + 1)])
+        return functools.reduce(combine, [rows[:, i : i + width] for i in range(2 * radius + 1)])
+
+    of_object = window(jnp.where(mask & (depth > 0), depth, jnp.inf), reach, jnp.minimum, jnp.inf)
+    before = ~mask & (depth > 0) & jnp.isfinite(of_object) & (depth < of_object - nearer)
+    cut = window(before, 1, jnp.logical_or, False)
+
+    # Edge padding: at the image's border the mask goes on.
+    smooth = jnp.pad(mask.astype(depth.dtype), reach + 1, mode="edge")
+    binomial = np.array([1, 4, 6, 4, 1], np.float32) / 16
+    smooth = jnp.sum(jnp.stack([w * smooth[i : i + height + 2] for i, w in enumerate(binomial)]), axis=0)
+    smooth = jnp.sum(jnp.stack([w * smooth[:, i : i + width + 2] for i, w in enumerate(binomial)]), axis=0)
+    slope = jnp.stack([smooth[1:-1, :-2] - smooth[1:-1, 2:], smooth[:-2, 1:-1] - smooth[2:, 1:-1]], axis=-1)
+    outward = slope / jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True) + 1e-12)
+
+    row, column = np.mgrid[:height, :width]
+    cell = jnp.asarray(np.stack([column, row], axis=-1), depth.dtype)
+    edge, place = jnp.zeros((height, width), bool), cell
+    around = jnp.pad(mask, 1, mode="edge")
+    for right, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        leaves = mask & ~around[1 + down : 1 + down + height, 1 + right : 1 + right + width]
+        place = jnp.where((leaves & ~edge)[..., None], cell + jnp.array([right / 2, down / 2], cell.dtype), place)
+        edge |= leaves
+    spread = ((row * 7919 + column * 104729) % 4093).astype(np.int32)  # a fixed shuffle: neighbours lie far apart
+    rank, chosen = lax.top_k(jnp.where(edge & ~cut, spread + 1, 0).reshape(-1), min(count, height * width))
+    return Contour(place.reshape(-1, 2)[chosen], outward.reshape(-1, 2)[chosen], rank > 0)
 
 
 class Cloud(eqx.Module):
@@ -28,26 +83,7 @@ class Cloud(eqx.Module):
     camera: Camera  # of the grid: one pixel per cell
     mask: Bool[Array, "g g"]  # the object, with or without a depth
     depth: Float[Array, "g g"]  # metres, background included; 0 = unknown
-    outline: Int[Array, "g g 2"]  # (column, row) of the nearest cell of the mask
-
-
-def nearest_inside(mask: Bool[Array, "h w"]) -> Int[Array, "h w 2"]:
-    """For every cell the (column, row) of the nearest cell that is set, the lowest row first; itself where none is.
-
-    Two passes, along the rows and then along the columns, give the exact Euclidean answer.
-    """
-    height, width = mask.shape
-    across = jnp.abs(jnp.arange(width)[:, None] - jnp.arange(width)[None, :])
-    far = height + width
-    steps = jnp.where(mask[:, None, :], across[None], far)  # row, from, to
-    column = jnp.argmin(steps, axis=-1)
-    away = jnp.min(steps, axis=-1)
-    down = jnp.arange(height)[:, None] - jnp.arange(height)[None, :]
-    squared = (down**2)[:, :, None] + (away**2)[None, :, :]  # from row, to row, column
-    row = jnp.argmin(squared, axis=1)
-    found = jnp.stack([jnp.take_along_axis(column, row, axis=0), row], axis=-1)
-    itself = jnp.stack(jnp.meshgrid(jnp.arange(width), jnp.arange(height)), axis=-1)
-    return jnp.where(jnp.any(mask), found, itself).astype(jnp.int32)
+    contour: Contour
 
 
 def refine(
@@ -73,9 +109,14 @@ def refine(
     normals = surface.normals[: config.points]
     trust = 0.25 + 0.75 * surface.seen[: config.points]
     start = camera_from_object
+    weight = jnp.asarray(config.silhouette_weight, start.translation.dtype)
 
     def residuals(step, _):
-        return _residuals(retract(start, step), points, normals, trust, cloud, config)
+        moved = retract(start, step)
+        terms = [*_depth_terms(moved, points, normals, trust, cloud, config)]
+        terms.append(_silhouette(moved, surface.points, cloud, config) * jnp.sqrt(weight))
+        together = jnp.concatenate(terms)
+        return together * jnp.sqrt(together.shape[0] / (2 + weight))  # so that the mean square is in [0, 1]
 
     count = 6 if scale_known else 7
     zero = jnp.zeros(count, start.translation.dtype)
@@ -111,7 +152,8 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=vector.dtype) * (1 - cosine * squared) + sine * cross + cosine * outer
 
 
-def _residuals(moved, points, normals, trust, cloud, config):
+def _depth_terms(moved, points, normals, trust, cloud, config):
+    """Surface to depth and depth to surface; the squares of each sum to at most 1."""
     placed = moved @ points
     facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
     distance = jnp.linalg.norm(placed, axis=-1)
@@ -119,9 +161,8 @@ def _residuals(moved, points, normals, trust, cloud, config):
     column, row, inside = _cells(placed, cloud)
     measured = cloud.valid[row, column] & inside
     forward = _robust(placed - cloud.points[row, column], facing, measured, moved.scale, config)
-    beside = _beside(placed, cloud.outline[row, column], moved.scale, cloud.camera, config)
+    forward = forward * jnp.sqrt(trust)
     on_mask = cloud.mask[row, column] & inside
-    forward = jnp.where(on_mask, forward, beside) * jnp.sqrt(trust)
     # Surface that faces away, lies behind an occluder, or falls into a hole of the depth image cannot have been
     # measured and costs nothing.
     nearer = (cloud.depth[row, column] > 0) & (cloud.depth[row, column] < placed[:, 2] - config.reach * moved.scale / 2)
@@ -132,12 +173,35 @@ def _residuals(moved, points, normals, trust, cloud, config):
     nearest = lax.stop_gradient(_nearest_visible(targets, placed, visible))
     backward = _robust(placed[nearest] - targets, facing[nearest], known, moved.scale, config)
     backward = jnp.where(known, backward * jnp.sqrt(trust[nearest]), 0)
-    share = lambda count: lax.stop_gradient(jnp.sum(count))
-    weigh = lambda count: jnp.sqrt(1 / jnp.maximum(count, 1)).astype(placed.dtype)
     # Hiding most of itself must not pay.
-    terms = [forward * weigh(jnp.maximum(share(counted), share(visible) // 3)), backward * weigh(share(known))]
-    together = jnp.concatenate(terms)
-    return together * jnp.sqrt(jnp.asarray(together.shape[0], placed.dtype) / 2)
+    count = jnp.maximum(jnp.sum(counted), jnp.sum(visible) // 3)
+    return _averaged(forward, lax.stop_gradient(count)), _averaged(backward, jnp.sum(known))
+
+
+def _averaged(values, count):
+    return values * jnp.sqrt(1 / jnp.maximum(count, 1)).astype(values.dtype)
+
+
+def _silhouette(moved, points, cloud, config):
+    """Geman–McClure on how far the object's silhouette is from the mask's border, along the border's normal.
+
+    The silhouette there is the surface point that reaches farthest out in a strip across the border, so that no mesh
+    is needed; where the strip is empty the cost is the maximum.
+    """
+    contour, camera = cloud.contour, cloud.camera
+    focal = jnp.mean(camera.focal)
+    offset = project(camera, lax.stop_gradient(moved @ points))[None] - contour.points[:, None]
+    normal = contour.outward[:, None]
+    along = jnp.sum(offset * normal, axis=-1)
+    across = offset[..., 0] * normal[..., 1] - offset[..., 1] * normal[..., 0]
+    reach = lax.stop_gradient(config.silhouette_reach * moved.scale * focal / jnp.maximum(moved.translation[2], 1e-6))
+    strip = (jnp.abs(across) < 1) & (jnp.abs(along) < reach)
+    farthest = lax.argmax(jnp.where(strip, along, -jnp.inf), 1, jnp.int32)
+    placed = moved @ points[farthest]
+    gap = jnp.sum((project(camera, placed) - contour.points) * contour.outward, axis=-1)
+    squared = (gap * placed[:, 2] / focal / (config.silhouette_width * moved.scale)) ** 2
+    cost = jnp.where(jnp.any(strip, axis=1), jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
+    return _averaged(jnp.where(contour.valid, cost, 0), jnp.sum(contour.valid))
 
 
 def _cells(placed, cloud):
@@ -146,18 +210,6 @@ def _cells(placed, cloud):
     pixel = lax.stop_gradient(jnp.round(project(cloud.camera, placed))).astype(jnp.int32)
     inside = jnp.all((pixel >= 0) & (pixel < jnp.array([width, height], jnp.int32)), axis=-1)
     return jnp.clip(pixel[:, 0], 0, width - 1), jnp.clip(pixel[:, 1], 0, height - 1), inside
-
-
-def _beside(placed, outline, scale, camera, config):
-    """Geman–McClure on the sideways distance to the mask's outline, a cell's own reach of it free.
-
-    On top of a fixed share: leaving the mask must cost more than fitting badly inside it.
-    """
-    offset = project(camera, placed) - outline.astype(placed.dtype)
-    apart = jnp.sqrt(jnp.sum(offset**2, axis=-1) + 1e-12)
-    metres = jnp.maximum(apart - 0.75, 0) * placed[:, 2] / jnp.mean(camera.focal)
-    squared = (metres / (config.outline_width * scale)) ** 2
-    return jnp.sqrt(0.8 + 0.2 * squared / (1 + squared))
 
 
 def _robust(offset, normal, ok, scale, config):

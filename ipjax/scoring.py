@@ -54,8 +54,7 @@ def depth_agreement(
     """
     height, width = depth.shape
     placed = camera_from_object @ surface.points
-    normals = jnp.sum(camera_from_object.rotation[None] * surface.normals[:, None, :], axis=-1)
-    facing = jnp.sum(normals * placed, axis=-1) < 0
+    facing = _facing(placed, surface.normals, camera_from_object)
     predicted = splat_depth(placed, facing, camera.focal, camera.centre, height, width)
     known = depth > 0
     seen = predicted > 0
@@ -133,8 +132,7 @@ def drawn_agreement(
         raise ValueError("these templates have no appearance to draw: onboard the object with appearance > 0")
     height, width = view.depth.shape
     placed = camera_from_object @ appearance.points
-    normals = jnp.sum(camera_from_object.rotation[None] * appearance.normals[:, None, :], axis=-1)
-    facing = jnp.sum(normals * placed, axis=-1) < 0
+    facing = _facing(placed, appearance.normals, camera_from_object)
     tolerance = config.tolerance * camera_from_object.scale
     image, depth = splat_colours(
         placed, appearance.colours, facing, view.camera.focal, view.camera.centre, height, width, tolerance / 2
@@ -143,10 +141,7 @@ def drawn_agreement(
     shown = (depth > 0) & ~hidden
     features = object_features(encoder(jnp.where(shown[..., None], image, 0)), templates)
     rows, columns, _ = features.shape
-    share = lambda pixels: jnp.mean(
-        pixels.astype(depth.dtype).reshape(rows, height // rows, columns, width // columns), axis=(1, 3)
-    ).reshape(-1)
-    drawn, seen = share(shown), share(view.mask)
+    drawn, seen = _patch_cover(shown, rows, columns), _patch_cover(view.mask, rows, columns)
     cosine = jnp.sum(features.reshape(query.patches.features.shape) * query.patches.features, axis=-1)
     either = jnp.sum(jnp.maximum(drawn, seen))
     return jnp.clip(jnp.sum(cosine * jnp.minimum(drawn, seen)) / jnp.maximum(either, 1e-9), 0, 1)
@@ -162,8 +157,7 @@ def _carried_cosine(
     pixel = project(query.view.camera, placed)
     cell = (pixel + 0.5) / jnp.array([width / columns, height / rows], pixel.dtype) - 0.5
     # Patches of the mask without a depth have no point, but their features are as good.
-    inside = query.view.mask.reshape(rows, height // rows, columns, width // columns)
-    inside = jnp.mean(inside.astype(pixel.dtype), axis=(1, 3)).reshape(-1) > 0.25
+    inside = _patch_cover(query.view.mask, rows, columns) > 0.25
     sampled, share = _sample(query.patches.features, inside, cell, rows, columns)
     norm = jnp.sqrt(jnp.sum(sampled * sampled, axis=-1) + 1e-12)
     cosine = jnp.sum(sampled * patches.features.astype(sampled.dtype), axis=-1) / norm
@@ -174,6 +168,21 @@ def _carried_cosine(
     counted = patches.valid & ~(nearer & ~query.view.mask[row, column])
     value = jnp.where(counted & (share > 0.25), cosine, 0)
     return jnp.sum(value) / jnp.maximum(jnp.sum(counted, dtype=value.dtype), 1)
+
+
+def _facing(
+    placed: Float[Array, "n 3"], normals: Float[Array, "n 3"], camera_from_object: Similarity
+) -> Bool[Array, "n"]:
+    """Which of the points placed in the camera frame show it their front."""
+    turned = jnp.sum(camera_from_object.rotation[None] * normals[:, None, :], axis=-1)
+    return jnp.sum(turned * placed, axis=-1) < 0
+
+
+def _patch_cover(pixels: Bool[Array, "h w"], rows: int, columns: int) -> Float[Array, "p"]:
+    """The share of each patch that is set."""
+    height, width = pixels.shape
+    patches = pixels.astype(jnp.float32).reshape(rows, height // rows, columns, width // columns)
+    return jnp.mean(patches, axis=(1, 3)).reshape(-1)
 
 
 def _grid_shape(query: Query) -> tuple[int, int]:

@@ -63,6 +63,14 @@ def write_protocol(root: Path, copies: int = 1) -> Path:
     return root
 
 
+def make_scene(root: Path, scene: int) -> Path:
+    """The folder of a scene, with those of its images."""
+    folder = root / "test" / f"{scene:06d}"
+    for kind in ("rgb", "depth", "mask_visib"):
+        (folder / kind).mkdir(parents=True)
+    return folder
+
+
 def write_images(root: Path, scenes: int = 1, images: int = 4) -> Path:
     """A small data set with images: object 2 and object 3 in each, 64 × 48 pixels, random colours, a flat depth."""
     from PIL import Image
@@ -71,9 +79,7 @@ def write_images(root: Path, scenes: int = 1, images: int = 4) -> Path:
     random = np.random.default_rng(0)
     targets = []
     for scene in range(scenes):
-        folder = root / "test" / f"{scene:06d}"
-        for kind in ("rgb", "depth", "mask_visib"):
-            (folder / kind).mkdir(parents=True)
+        folder = make_scene(root, scene)
         camera, truth = {}, {}
         for image in range(images):
             camera[str(image)] = {"cam_K": [100.0, 0, 32, 0, 100.0, 24, 0, 0, 1], "depth_scale": 0.5}
@@ -118,9 +124,7 @@ def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 1
         (root / folder / "models_info.json").write_text(json.dumps({"1": {"diameter": size}}))
     random, targets = np.random.default_rng(3), []
     for scene in range(scenes):
-        folder = root / "test" / f"{scene:06d}"
-        for kind in ("rgb", "depth", "mask_visib"):
-            (folder / kind).mkdir(parents=True)
+        folder = make_scene(root, scene)
         camera, truth = {}, {}
         for image in range(images):
             rotation, shift = random_rotation(random), np.array([*random.uniform(-0.1, 0.1, 2), 0.7])

@@ -267,3 +267,15 @@ def test_a_photo_goes_through_the_command(encoder, monkeypatch, tmp_path, capsys
     told = capsys.readouterr().out
     assert "diameter unknown" in told and "made without learned weights" in told
     assert load(out)[1].reference.method == "inflate" and mesh.stat().st_size > 1000
+
+
+def test_too_many_channels_are_refused_before_anything_is_drawn(encoder, monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("IPJAX_NO_CACHE", "1")
+    monkeypatch.setattr(cli, "_load_encoder", lambda arguments: encoder)
+    monkeypatch.setattr("ipjax.host.onboarding.render", lambda *_, **__: pytest.fail("views were rendered"))
+    rgb, mask, _ = ball()
+    Image.fromarray(np.dstack([rgb, np.uint8(255) * mask.astype(np.uint8)])).save(tmp_path / "ball.png")
+    words = ["onboard", tmp_path / "ball.png", "-o", tmp_path / "ball.ipjax", "--channels", 5000]
+    assert cli.main([str(w) for w in words]) == 2
+    assert re.search(r"features of \d+ channels cannot be cut to 5000", capsys.readouterr().err)
+    assert not (tmp_path / "ball.ipjax").exists()

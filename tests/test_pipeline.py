@@ -52,6 +52,12 @@ def same(one, other, tolerance):
     np.testing.assert_allclose(one.scale, other.scale, rtol=tolerance)
 
 
+def assert_near(found, truth, diameters, share):
+    """Its centre within so many diameters, its scale within a share."""
+    assert float(jnp.linalg.norm(found.translation - truth.translation)) < diameters * float(truth.scale)
+    assert abs(float(found.scale / truth.scale) - 1) < share
+
+
 @given(st.integers(0, 10_000))
 @settings(max_examples=12)
 def test_recovers_pose_and_size(templates, seed):
@@ -59,9 +65,7 @@ def test_recovers_pose_and_size(templates, seed):
     query, truth = problems.make_query(seed)
     found = estimate(templates, query, jax.random.key(0), TINY)
     assert bool(found.success)
-    offset = found.camera_from_object.translation - truth.translation
-    assert float(jnp.linalg.norm(offset)) < 0.15 * float(truth.scale)
-    assert abs(float(found.camera_from_object.scale / truth.scale) - 1) < 0.2
+    assert_near(found.camera_from_object, truth, 0.15, 0.2)
 
 
 def test_a_known_size_is_kept(templates):
@@ -261,9 +265,7 @@ def test_fewer_channels_still_recover_pose_and_size(templates):
         query, truth = problems.make_query(seed)
         found = estimate(short, query, jax.random.key(0), TINY)
         assert bool(found.success)
-        offset = found.camera_from_object.translation - truth.translation
-        assert float(jnp.linalg.norm(offset)) < 0.15 * float(truth.scale)
-        assert abs(float(found.camera_from_object.scale / truth.scale) - 1) < 0.15
+        assert_near(found.camera_from_object, truth, 0.15, 0.15)
     with pytest.raises(ValueError, match="16 channels"):
         query, _ = problems.make_query(0, channels=16)
         ipjax.estimate(short, query, jax.random.key(0), TINY)

@@ -13,36 +13,42 @@ from ipjax.features import lift
 from ipjax.refinement import (
     Cloud,
     _nearest_visible,
-    nearest_inside,
     refine,
     retract,
     rotation_from_vector,
     solve_positive,
+    trace_contour,
 )
 from ipjax.types import Camera
 
+GRID = 56  # as the defaults have it
 CONFIG = RefineConfig(steps=15, points=256)
 run = jax.jit(refine, static_argnames="scale_known")
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """The ellipsoid's surface, its exact depth on a 28 × 28 grid, and the true pose."""
+    """The ellipsoid's surface, its exact depth on a 56 × 56 grid, and the true pose."""
     query, truth = problems.make_query(4)
-    points, cover = lift(query.view, 28, 28, 0.05)
-    camera = query.view.camera
-    camera = Camera(camera.focal / 4, (camera.centre + 0.5) / 4 - 0.5)
-    valid = (cover > 0.3).reshape(28, 28)
-    points = points.reshape(28, 28, 3)
-    cloud = Cloud(points, valid, camera, valid, jnp.where(valid, points[..., 2], 0), nearest_inside(valid))
-    return problems.make_surface(512), cloud, truth
+    points, cover = lift(query.view, GRID, GRID, 0.05)
+    camera, cell = query.view.camera, query.view.depth.shape[0] / GRID
+    camera = Camera(camera.focal / cell, (camera.centre + 0.5) / cell - 0.5)
+    valid = (cover > 0.3).reshape(GRID, GRID)
+    points = points.reshape(GRID, GRID, 3)
+    return problems.make_surface(2048), gather(points, valid, camera, valid, points[..., 2]), truth
+
+
+def gather(points, valid, camera, mask, depth) -> Cloud:
+    """A cloud with the border of its mask, on any of whose cells something 3 cm nearer is an occluder."""
+    depth = jnp.where(jnp.isfinite(depth), depth, 0)
+    return Cloud(points, valid, camera, mask, depth, trace_contour(mask, depth, 0.03, 96))
 
 
 def hide(cloud: Cloud, hidden) -> Cloud:
     """The same scene with something close to the camera over the cells that are `hidden`."""
     mask = cloud.mask & ~hidden
     depth = jnp.where(hidden, 0.3 * jnp.max(cloud.depth), cloud.depth)
-    return Cloud(cloud.points, cloud.valid & ~hidden, cloud.camera, mask, depth, nearest_inside(mask))
+    return gather(cloud.points, cloud.valid & ~hidden, cloud.camera, mask, depth)
 
 
 @given(seed=st.integers(0, 2**31))
@@ -72,43 +78,72 @@ def test_a_known_scale_stays(scene, seed):
 def test_without_depth_nothing_moves(scene):
     surface, cloud, truth = scene
     nothing = jnp.zeros_like(cloud.valid)
-    blind = Cloud(
-        jnp.zeros_like(cloud.points),
-        nothing,
-        cloud.camera,
-        nothing,
-        jnp.zeros_like(cloud.depth),
-        nearest_inside(nothing),
-    )
+    blind = gather(jnp.zeros_like(cloud.points), nothing, cloud.camera, nothing, jnp.zeros_like(cloud.depth))
     found, cost = run(surface, blind, truth, CONFIG)
     assert bool(jnp.isfinite(cost))
     np.testing.assert_allclose(found.translation, truth.translation, atol=1e-6)
 
 
-@given(seed=st.integers(0, 2**31), share=st.floats(0, 0.3))
-def test_the_nearest_cell_of_a_mask(seed, share):
-    mask = np.random.default_rng(seed).random((9, 13)) < share
-    found = np.asarray(jax.jit(nearest_inside)(jnp.asarray(mask)))
-    rows, columns = np.mgrid[:9, :13]
-    if not mask.any():
-        np.testing.assert_array_equal(found, np.stack([columns, rows], axis=-1))
-        return
-    assert mask[found[..., 1], found[..., 0]].all()
-    r, c = np.nonzero(mask)
-    least = ((rows[..., None] - r) ** 2 + (columns[..., None] - c) ** 2).min(-1)
-    np.testing.assert_array_equal((found[..., 0] - columns) ** 2 + (found[..., 1] - rows) ** 2, least)
+def disc(radius, height=21, width=25):
+    row, column = np.mgrid[:height, :width]
+    return (row - 10) ** 2 + (column - 11) ** 2 <= radius**2
+
+
+trace = jax.jit(trace_contour, static_argnames="count")
+
+
+@pytest.mark.parametrize("count", [16, 200])
+def test_the_border_of_a_mask(count):
+    """Half a cell outside the disc's own cells, its normals outward; no more points than cells at the border."""
+    mask = disc(7)
+    found = trace(jnp.asarray(mask), jnp.ones(mask.shape, jnp.float32), 0.1, count=count)
+    points, outward, valid = (np.asarray(x) for x in (found.points, found.outward, found.valid))
+    inner = mask[1:-1, 1:-1] & mask[2:, 1:-1] & mask[:-2, 1:-1] & mask[1:-1, 2:] & mask[1:-1, :-2]
+    assert valid.sum() == min(count, mask.sum() - inner.sum())
+    away = points[valid] - [11, 10]
+    distance = np.linalg.norm(away, axis=-1)
+    assert (np.abs(distance - 7.2) < 0.8).all()
+    assert (np.sum(away / distance[:, None] * outward[valid], axis=-1) > 0.95).all()
+    directions = np.sort(np.arctan2(away[:, 1], away[:, 0]))
+    gaps = np.diff(np.append(directions, directions[0] + 2 * np.pi))
+    assert gaps.max() < (1.5 if count == 16 else 0.5)  # spread around it, not bunched
+
+
+def test_a_border_that_something_cuts_is_no_silhouette():
+    """What is nearer, and the image's own border, cut the object; what is farther or unknown does not."""
+    mask, column = disc(7), np.mgrid[:21, :25][1]
+    mask &= column <= 14
+    depth = np.where(column > 14, 0.5, 1.0).astype(np.float32)  # an occluder on the right
+    depth[~mask & (column < 8)] = 0  # unknown on the left
+    depth[~mask & (column >= 8) & (column <= 14)] = 2
+    found = trace(jnp.asarray(mask), jnp.asarray(depth), 0.1, count=200)
+    kept = np.asarray(found.points)[np.asarray(found.valid)]
+    assert kept[:, 0].min() < 5 and kept[:, 0].max() < 14
+    whole = trace(jnp.asarray(mask), jnp.ones_like(jnp.asarray(depth)), 0.1, count=200)
+    assert np.asarray(whole.points)[np.asarray(whole.valid), 0].max() == 14.5
+    beyond = trace(jnp.asarray(mask[:, 8:]), jnp.ones((21, 17), jnp.float32), 0.1, count=200)  # cut by the image
+    assert np.asarray(beyond.points)[np.asarray(beyond.valid), 0].min() == 0
 
 
 def test_a_mask_alone_pulls_sideways(scene):
-    """No depth at all: what sticks out of the mask still comes back, across the rays."""
+    """No depth at all: the silhouette alone still brings the object back, across the rays."""
     surface, cloud, truth = scene
-    blind = Cloud(
-        cloud.points, jnp.zeros_like(cloud.valid), cloud.camera, cloud.mask, jnp.zeros_like(cloud.depth), cloud.outline
-    )
-    start = retract(truth, jnp.array([0, 0, 0, 0.15, 0.0, 0.0], jnp.float32))
-    found, _ = run(surface, blind, start, CONFIG, scale_known=True)
+    nothing = jnp.zeros_like(cloud.depth)
+    blind = gather(cloud.points, jnp.zeros_like(cloud.valid), cloud.camera, cloud.mask, nothing)
     aside = lambda pose: float(jnp.linalg.norm((pose.translation - truth.translation)[:2])) / float(truth.scale)
-    assert aside(start) > 0.14 and aside(found) < 0.07
+    start = retract(truth, jnp.array([0, 0, 0, 0.08, 0.0, 0.0], jnp.float32))
+    found, _ = run(surface, blind, start, CONFIG, scale_known=True)
+    assert aside(start) > 0.075 and aside(found) < 0.025
+
+
+def test_a_mask_alone_knows_the_size(scene):
+    """No depth at all: the wrong size in the image costs, either way."""
+    surface, cloud, truth = scene
+    nothing = jnp.zeros_like(cloud.depth)
+    blind = gather(cloud.points, jnp.zeros_like(cloud.valid), cloud.camera, cloud.mask, nothing)
+    sized = lambda step: retract(truth, jnp.array([0, 0, 0, 0, 0, 0, step], jnp.float32))
+    cost = [float(run(surface, blind, sized(step), RefineConfig(steps=0))[1]) for step in (-0.06, 0.0, 0.06)]
+    assert cost[1] < 0.5 * cost[0] and cost[1] < 0.5 * cost[2]
 
 
 @pytest.mark.parametrize("side", ["left", "top"])
@@ -117,7 +152,7 @@ def test_what_is_hidden_does_not_count(scene, side):
     surface, cloud, truth = scene
     inside = np.argwhere(np.asarray(cloud.mask))
     row, column = (inside.min(0) + (inside.max(0) - inside.min(0)) / 3).round().astype(int)
-    hidden = jnp.asarray((np.mgrid[:28, :28][1] < column) if side == "left" else (np.mgrid[:28, :28][0] < row))
+    hidden = jnp.asarray((np.mgrid[:GRID, :GRID][1] < column) if side == "left" else (np.mgrid[:GRID, :GRID][0] < row))
     found, _ = run(surface, hide(cloud, hidden), truth, CONFIG)
     assert abs(float(found.scale / truth.scale) - 1) < 0.03
     assert float(jnp.linalg.norm(found.translation - truth.translation)) < 0.03 * float(truth.scale)

@@ -256,9 +256,9 @@ class Dataset:
             if not whole.is_file():
                 raise
             entry = self._json(whole)
-            return tuple(
-                int(x) for x in _numbers({"size": [entry.get("width"), entry.get("height")]}, "size", 2, str(whole))
-            )  # type: ignore[return-value]
+            size = {"size": [entry.get("width"), entry.get("height")]}
+            width, height = _numbers(size, "size", 2, str(whole))
+            return int(width), int(height)
         try:
             with Image.open(path) as image:
                 return image.size

@@ -129,7 +129,7 @@ def _to_original(camera_from_object: Similarity, info: ObjectInfo, original_from
 def compare(found: Similarity, true: Similarity, mesh: Mesh) -> Comparison:
     """Two ``camera_from_object`` of one mesh of unit diameter, whose origin is its box's centre."""
     found, true = (jax.tree.map(lambda x: np.asarray(x, np.float64), pose) for pose in (found, true))
-    cosine = (np.trace(found.rotation @ true.rotation.T) - 1) / 2  # type: ignore[operator]
+    cosine = (np.trace(np.asarray(found.rotation) @ np.asarray(true.rotation).T) - 1) / 2
     points = sample_surface(mesh, 2000, seed=0)[0]
     a, b = (float(p.scale) * points @ np.asarray(p.rotation).T + np.asarray(p.translation) for p in (found, true))
     size = float(true.scale)

@@ -48,9 +48,8 @@ from ipjax.types import Camera, Similarity
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
 YCBV_SYMMETRIC = frozenset({1, 13, 14, 16, 18, 19, 20, 21})  # ADD(-S) uses ADD-S for these (dataset_params.py)
 DELTA = 0.015  # metres: VSD's visibility tolerance
-FEW = (
-    10  # targets below which no AUC is told: the toolbox's curve takes its higher value, so one target under 10 cm is 1
-)
+# Targets below which no AUC is told: the toolbox's curve takes its higher value, so one target under 10 cm is 1.
+FEW = 10
 DETECTIONS = 100  # estimates per image that count for average precision (BOP 2024)
 BATCH = 64  # pairs of poses per call
 DRAWN = 48_000_000  # pixels drawn by one process for VSD; seven bytes each
@@ -621,15 +620,15 @@ class _Job:
 
     def discrepancies(self, slots: list[_Slot]) -> None:
         """Fill in VSD of all estimates. Every pose is drawn once, several objects in one child process."""
-        todo: dict[tuple[int, int], list[tuple[_Slot, int, int]]] = {}
+        by_size: dict[tuple[int, int], list[tuple[_Slot, int, int]]] = {}
         for slot in slots:
             slot.vsd = np.ones((len(slot.estimates), len(slot.truths), len(errors.THRESHOLDS)))
             for e, g in slot.pairs():
                 truth, found = Pose(slot.truths[g].rotation, slot.truths[g].translation), _pose(slot.estimates[e])
                 if _projections_overlap(self.infos[slot.row.obj_id].diameter, truth, found):
                     size = self.dataset.image_size(slot.row.scene_id, slot.row.im_id)
-                    todo.setdefault(size, []).append((slot, e, g))
-        for size, pairs in sorted(todo.items()):
+                    by_size.setdefault(size, []).append((slot, e, g))
+        for size, pairs in sorted(by_size.items()):
             pairs.sort(key=lambda pair: (pair[0].row.obj_id, pair[0].row.scene_id, pair[0].row.im_id))
             most = max(1, DRAWN // (size[0] * size[1] * 2))
             parts = [pairs[start : start + most] for start in range(0, len(pairs), most)]

@@ -5,6 +5,7 @@ object of the same shapes. The configuration is baked in.
 """
 
 import json
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -98,10 +99,8 @@ def export(
     """
     if batch is not None and batch < 1:
         raise ValueError(f"the batch must be a positive number of queries, not {batch}")
-    try:
-        import flatbuffers  # noqa: F401
-    except ImportError:
-        raise ValueError("exporting needs the package flatbuffers: pip install 'ipjax[export]'") from None
+    if find_spec("flatbuffers") is None:
+        raise ValueError("exporting needs the package flatbuffers: pip install 'ipjax[export]'")
     from jax import export as jax_export
 
     shape = lambda tree, lead: jax.tree.map(

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
-from ipjax.features import centre, cut, describe, principal_basis
+from ipjax.features import centre, check_cut, cut, describe, principal_basis
 from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_appearance, sample_surface, sample_texture
 from ipjax.host.objects import ObjectInfo, save
 from ipjax.host.rendering import render
@@ -75,7 +75,13 @@ def make_templates(
 
     Returns:
       The templates, and their images ``[v resolution resolution 3]`` uint8 for pictures.
+
+    Raises:
+      ValueError: more ``config.channels`` than the encoder's features have, said before anything takes time.
     """
+    if config.channels:
+        image = jax.ShapeDtypeStruct((config.resolution, config.resolution, 3), jnp.float32)
+        check_cut(jax.eval_shape(encoder, image).shape[-1], config.channels)
     poses = viewpoints(config.directions, config.rolls, distance=config.distance)
     cameras = framing_cameras(mesh.vertices, poses, config.resolution, config.fill)
     views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)

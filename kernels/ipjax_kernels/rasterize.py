@@ -31,16 +31,10 @@ def splat_depth(
     Points that are not valid, behind the camera or not finite are absent. Vmap over leading axes. Memory: one padded
     image; time: n scatters and 4 · radius image minima.
     """
-    z = points[:, 2]
-    ahead = valid & (z > 0) & jnp.all(jnp.isfinite(points), axis=-1)
-    pixel = focal * points[:, :2] / jnp.where(ahead, z, 1)[:, None] + centre
-    pixel = jnp.where(ahead[:, None], jnp.clip(pixel, -1e6, 1e6), -1e6)
-    column, row = jnp.round(pixel).astype(jnp.int32).T + radius
     rows, columns = height + 2 * radius, width + 2 * radius
-    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    place = jnp.where(inside, row * columns + column, rows * columns)
+    place = _pixels(points, valid, focal, centre + radius, rows, columns)
     far = jnp.asarray(jnp.inf, points.dtype)
-    image = jnp.full(rows * columns, far).at[place].min(z, mode="drop").reshape(rows, columns)
+    image = jnp.full(rows * columns, far).at[place].min(points[:, 2], mode="drop").reshape(rows, columns)
     # A square splat is a minimum filter of the image of single points, and the filter is separable.
     image = functools.reduce(jnp.minimum, [image[i : i + height] for i in range(2 * radius + 1)])
     image = functools.reduce(jnp.minimum, [image[:, i : i + width] for i in range(2 * radius + 1)])
@@ -64,14 +58,9 @@ def splat_colours(
     pixel without any, the mean of its neighbours'. Meant for several points per pixel. Otherwise as `splat_depth`.
     """
     depth = splat_depth(points, valid, focal, centre, height, width)
-    z = points[:, 2]
-    ahead = valid & (z > 0) & jnp.all(jnp.isfinite(points), axis=-1)
-    pixel = focal * points[:, :2] / jnp.where(ahead, z, 1)[:, None] + centre
-    column, row = jnp.round(jnp.where(ahead[:, None], jnp.clip(pixel, -1e6, 1e6), -1e6)).astype(jnp.int32).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    place = jnp.where(inside, row * width + column, height * width)
+    place = _pixels(points, valid, focal, centre, height, width)
     nearest = depth.reshape(-1).at[place].get(mode="fill", fill_value=-jnp.inf)
-    shown = jnp.where(z <= nearest + behind, place, height * width)
+    shown = jnp.where(points[:, 2] <= nearest + behind, place, height * width)
     paint = jnp.concatenate([colours, jnp.ones_like(colours[:, :1])], axis=-1)
     sums = jnp.zeros((height * width, 4), colours.dtype).at[shown].add(paint, mode="drop").reshape(height, width, 4)
     padded = jnp.pad(sums, ((1, 1), (1, 1), (0, 0)))
@@ -79,6 +68,23 @@ def splat_colours(
     chosen = jnp.where(sums[..., 3:] > 0, sums, around)
     image = chosen[..., :3] / jnp.maximum(chosen[..., 3:], 1)
     return jnp.where((depth > 0)[..., None], image, 0), depth
+
+
+def _pixels(
+    points: Float[Array, "n 3"],
+    valid: Bool[Array, " n"],
+    focal: Float[Array, "2"],
+    centre: Float[Array, "2"],
+    height: int,
+    width: int,
+) -> Int[Array, " n"]:
+    """The index, row by row, of the pixel that each point is seen in; height · width for one that is not seen."""
+    z = points[:, 2]
+    ahead = valid & (z > 0) & jnp.all(jnp.isfinite(points), axis=-1)
+    pixel = focal * points[:, :2] / jnp.where(ahead, z, 1)[:, None] + centre
+    column, row = jnp.round(jnp.where(ahead[:, None], jnp.clip(pixel, -1e6, 1e6), -1e6)).astype(jnp.int32).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    return jnp.where(inside, row * width + column, height * width)
 
 
 @functools.partial(jax.jit, static_argnames=("height", "width", "tile", "block"))
