@@ -1,6 +1,7 @@
 """``python -m benchmarks.table results.json … [--into README.md]``: results as Markdown, by hand never.
 
-With ``--into`` the text between ``<!-- benchmarks -->`` and ``<!-- /benchmarks -->`` of that file is replaced.
+Every row is written beside each results file (``results.md``). With ``--into`` the most telling ones replace the text
+between ``<!-- benchmarks -->`` and ``<!-- /benchmarks -->`` of that file.
 """
 
 import argparse
@@ -25,17 +26,31 @@ COLUMNS = {
 }
 
 
-def render(results: dict) -> str:
-    """One device's results as a heading and a table."""
+SHORT = ("what", "how", "size", "median", "temporary", "ratio")
+SIZES = ("400 × 256² × 384", "50 × 576² × 384", "25 × 900² × 384")
+
+
+def is_telling(row: dict) -> bool:
+    """Of the neighbours only the kernel, its product and the plain form, at three sizes in float32."""
+    if row["name"] != "neighbours":
+        return True
+    plain = row["implementation"] in ("product, view by view", "nearest (xla)", "einsum + argmax")
+    return plain and row["size"] in SIZES and row["dtype"] == "float32"
+
+
+def render(results: dict, short: bool = False) -> str:
+    """One device's results as a heading and a table, of all rows or the most telling ones."""
+    columns = {name: cell for name, cell in COLUMNS.items() if not short or name in SHORT}
+    rows = [row for row in results["rows"] if not short or is_telling(row)]
     lines = [
         f"**{results['device']}** ({results['platform']}, {results['cores']} cores), jax {results['jax']}, "
         f"Python {results['python']}, {results['date']}, commit {results.get('commit', 'unknown')}"
         + (" — quick run, small sizes" if results["quick"] else ""),
         "",
-        "| " + " | ".join(COLUMNS) + " |",
-        "|" + " --- |" * len(COLUMNS),
+        "| " + " | ".join(columns) + " |",
+        "|" + " --- |" * len(columns),
     ]
-    lines += ["| " + " | ".join(cell(row) for cell in COLUMNS.values()) + " |" for row in results["rows"]]
+    lines += ["| " + " | ".join(cell(row) for cell in columns.values()) + " |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
@@ -60,10 +75,13 @@ def main():
     parser.add_argument("results", type=Path, nargs="+")
     parser.add_argument("--into", type=Path, metavar="FILE")
     options = parser.parse_args()
-    text = "\n".join(render(json.loads(path.read_text())) for path in options.results)
+    found = {path: json.loads(path.read_text()) for path in options.results}
     if options.into is None:
-        print(text)
+        print("\n".join(render(results) for results in found.values()))
         return
+    for path, results in found.items():
+        path.with_suffix(".md").write_text(render(results))
+    text = "\n".join(render(results, short=True) for results in found.values())
     page = options.into.read_text()
     if BEGIN not in page or END not in page:
         parser.error(f"{options.into} has no {BEGIN} … {END}")

@@ -24,13 +24,14 @@ RESULTS = {
         {
             "name": "neighbours",
             "implementation": "nearest (xla)",
-            "size": "1 × 2² × 3",
+            "size": "50 × 576² × 384",
             "dtype": "float32",
             "ratio_to_product": 1.25,
             "ratio_to_large_product": 0.5,
             "temporary_bytes": 2**20,
             **summarise([0.001, 0.002, 0.003]),
         },
+        {"name": "neighbours", "implementation": "odd", "size": "1", "dtype": "float32"},
         {"name": "estimate", "implementation": "batch", "size": "2", "dtype": "float32", "queries_per_s": 12.0},
     ],
 }
@@ -46,7 +47,8 @@ def test_a_table_replaces_what_stands_between_its_marks(tmp_path, monkeypatch):
         text = page.read_text()
         assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
         assert "2 ms" in text and "1.25 × product" in text and "12 queries/s" in text and "1 MiB" in text
-        assert text.count(table.BEGIN) == 1
+        assert text.count(table.BEGIN) == 1 and "| odd |" not in text
+        assert "| odd |" in results.with_suffix(".md").read_text()  # every row, beside the results
     page.write_text("no marks")
     with pytest.raises(SystemExit):
         table.main()
