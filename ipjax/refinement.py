@@ -97,7 +97,7 @@ def refine(
     """Improve one hypothesis; the caller vmaps.
 
     Args:
-      surface: the object's surface; its first ``config.points`` points are used.
+      surface: the object's surface; its first ``config.points`` points are fitted to the depth, all to the mask.
       cloud: the masked depth, and what lies around it.
       camera_from_object: the hypothesis.
       scale_known: leave the scale as it is (SE(3) instead of Sim(3)).
