@@ -8,8 +8,7 @@ import json
 import time
 from pathlib import Path
 
-from benchmarks.measure import describe_device
-from benchmarks.results_page import commit
+from benchmarks.measure import commit, describe_device
 from benchmarks.table import render
 
 

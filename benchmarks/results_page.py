@@ -12,14 +12,13 @@ import dataclasses
 import html
 import json
 import math
-import subprocess
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.measure import describe_device
+from benchmarks.measure import commit, describe_device
 from ipjax.host.evaluation import FEW
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
@@ -67,21 +66,6 @@ def read_run(folder: Path) -> dict[str, Any]:
         run["settings"] = json.loads(file.readline())["settings"]
     run["folder"] = folder
     return run
-
-
-def commit() -> str:
-    """The commit of this checkout, with a mark where files differ from it; "unknown" outside of one."""
-    try:
-        said = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=10"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return "unknown"
-    return said.stdout.strip()
 
 
 def percent(value: float | None, interval=None) -> str:

@@ -79,12 +79,12 @@ def main():
     if options.into is None:
         print("\n".join(render(results) for results in found.values()))
         return
-    for path, results in found.items():
-        path.with_suffix(".md").write_text(render(results))
     text = "\n".join(render(results, short=True) for results in found.values())
     page = options.into.read_text()
     if BEGIN not in page or END not in page:
         parser.error(f"{options.into} has no {BEGIN} … {END}")
+    for path, results in found.items():
+        path.with_suffix(".md").write_text(render(results))
     before, rest = page.split(BEGIN, 1)
     options.into.write_text(before + BEGIN + "\n" + text + END + rest.split(END, 1)[1])
 

@@ -400,7 +400,9 @@ def density_grid(
     kernel = model.decoder.layers[0].kernel[...].reshape(3, channels, -1)
     planes = jnp.einsum("pchw,pcn->phwn", triplane, kernel, precision=_HIGHEST)
     planes = jnp.einsum("aw,bh,phwn->pabn", along_width, along_height, planes, precision=_HIGHEST)
-    yz = planes[2] + model.decoder.layers[0].bias[...]  # type: ignore[index]
+    bias = model.decoder.layers[0].bias
+    assert bias is not None  # the decoder's layers have one
+    yz = planes[2] + bias[...]
 
     def slab(xy_xz: Float[Array, "2 r n"]) -> Float[Array, "r r"]:
         raw = model.decoder.after_first(xy_xz[0][:, None] + xy_xz[1][None] + yz)
