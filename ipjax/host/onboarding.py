@@ -1,6 +1,9 @@
 """From a mesh to templates: render the object from everywhere, describe every view, lift every patch."""
 
 import dataclasses
+import os
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -87,16 +90,30 @@ def make_templates(
     views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)
     views = dataclasses.replace(views, camera=jax.tree.map(np.asarray, cameras))
     surface = Surface(*(jnp.asarray(x, jnp.float32) for x in sample_surface(mesh, config.surface, seed=0)))
-    patches, seen = [], []
     held = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
-    for index in tqdm(range(len(poses.scale)), "describing", unit="view", disable=not progress):
-        pose = jax.tree.map(lambda x, index=index: x[index], held)
+
+    def see(index: int) -> tuple[Patches, Array]:
+        pose = jax.tree.map(lambda x: x[index], held)
         camera = Camera(jnp.asarray(views.camera.focal[index]), jnp.asarray(views.camera.centre[index]))
         rgb = views.rgb[index].astype(np.float32) / 255
         view = View(jnp.asarray(rgb), jnp.asarray(views.depth[index]), jnp.asarray(views.mask[index]), camera)
-        one, sure = _describe_view(encoder, view, pose, surface, config.describe)
-        patches.append(one)
-        seen.append(sure)
+        return jax.block_until_ready(look(encoder, view, pose, surface, config.describe))
+
+    look, workers = _describe_view, 1
+    if jax.default_backend() == "cpu":
+        # One view per core is faster than one view on all cores, most of all where cores are shared with others.
+        look = _describe_view_on_one_core
+        workers = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    patches, seen = [], []
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            found = pool.map(see, range(len(poses.scale)))
+            for one, sure in tqdm(found, "describing", len(poses.scale), unit="view", disable=not progress):
+                patches.append(one)
+                seen.append(sure)
+        except BaseException:  # Ctrl-C too: what has not begun need not be
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     patches, mean, norm = jax.jit(centre)(jax.tree.map(lambda *x: jnp.stack(x), *patches))
     basis = None
     if config.channels:
@@ -120,8 +137,7 @@ def make_templates(
     return templates, views.rgb
 
 
-@jax.jit
-def _describe_view(
+def _describe(
     encoder: Encoder, view: View, camera_from_object: Similarity, surface: Surface, config: DescribeConfig
 ) -> tuple[Patches, Float[Array, "p"]]:
     """The patches of one template in the object's frame, and how far the surface under each was seen."""
@@ -132,6 +148,10 @@ def _describe_view(
     squared = jnp.sum((points[:, None] - surface.points[None]) ** 2, axis=-1)
     seen = surface.seen[jnp.argmin(squared, axis=1)]
     return Patches(patches.features.astype(jnp.float16), points, patches.grid, patches.valid), seen
+
+
+_describe_view_on_one_core = jax.jit(_describe, compiler_options={"xla_cpu_multi_thread_eigen": False})
+_describe_view = jax.jit(_describe)
 
 
 def onboard(
