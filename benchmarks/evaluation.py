@@ -144,7 +144,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("data", type=Path, nargs="+", metavar="DATA", help="in BOP layout")
     parser.add_argument("-o", "--output", type=Path, default=Path("out/evaluation"), help="folder of all results")
     parser.add_argument(
-        "--methods", nargs="+", default=["paper", "default", "auto"], metavar="paper|default|classical|FILE"
+        "--methods", nargs="+", default=["paper", "default", "auto"], metavar="paper|fast|default|classical|FILE"
     )
     parser.add_argument("--levels", type=int, nargs="+", default=[0], choices=range(5), help="qualities of the meshes")
     parser.add_argument(

@@ -2,7 +2,7 @@
 
     python -m benchmarks.photo_pairs ycbv --data FOLDER [--limit N]
     python -m benchmarks.photo_pairs synthetic [--data FOLDER] [--pairs 200] [--limit N]
-    python -m benchmarks.photo_pairs table RESULTS.jsonl …
+    python -m benchmarks.photo_pairs table RESULTS.jsonl … [--page benchmarks/results/photos.md]
 
 Each pair is a reference (one masked photo, with or without its depth) and a query (an RGB-D frame of the same object).
 The object is made from the reference without learned reconstruction weights ("rgb": the outline inflated, "rgbd": the
@@ -10,6 +10,9 @@ depth completed) and found in the query; "scan" onboards the true mesh, the uppe
 the canonical frame: estimated camera_from_reference_camera ∘ true reference_camera_from_object is compared with the
 true pose in the query. A reference without depth has no unit: there, one unit is the true depth of the object's centre
 in the reference, and the size is found by the estimate; with depth, the measured size is kept.
+
+In some synthetic scenes the object is also sought behind another object's mask, where it is not; those lines, and what
+each estimate says of its own certainty, are what `benchmarks.calibration` reads.
 
 Results are lines of JSON, one per pair and method, written as they come: run again to go on. Templates are fewer than
 by default (24 × 8 instead of 40 × 10) for speed.
@@ -29,7 +32,10 @@ import numpy as np
 
 METHODS = ("rgb", "rgbd", "scan")
 BINS = (0, 15, 30, 45, 60, 90, 120, 180.1)  # degrees between the directions from which the two frames see the object
-PER_REFERENCE = 4  # queries of each synthetic reference: onboarding takes most of the time
+PER_REFERENCE = 10  # queries of each synthetic reference: onboarding takes most of the time
+ABSENT = 2  # of them in which the object is also sought where another one stands
+SCANS = 3  # of them, for objects made in code, that are also tried with the true mesh: it has no reference
+POINTS = 4000  # of the model that errors are measured on
 
 
 @dataclasses.dataclass
@@ -43,6 +49,7 @@ class Shot:
     K: np.ndarray
     rotation: np.ndarray  # camera_from_object
     translation: np.ndarray  # metres
+    other: np.ndarray | None = None  # the mask of another object
 
 
 @dataclasses.dataclass
@@ -55,6 +62,7 @@ class Group:
     model: Any  # ipjax.host.evaluation.Model
     reference: Shot
     queries: list[Shot]
+    made: bool = True  # tried with the true mesh, too
 
 
 def view_angle(first: Shot, second: Shot) -> float:
@@ -120,22 +128,26 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0) -> Iterator[G
     none = np.eye(3)[None], np.zeros((1, 3))
     for turn in range(-(-pairs // PER_REFERENCE)):
         rng = np.random.default_rng([seed, turn])
-        if scans and turn % 2:
+        made = not (scans and turn % 2)
+        if not made:
             name, mesh = scans[turn // 2 % len(scans)]
         else:
-            kind = KINDS[turn % len(KINDS)]
+            kind = KINDS[turn // 2 % len(KINDS)] if scans else KINDS[turn % len(KINDS)]
             name, mesh = f"{kind}-{turn}", make_object(kind, 1000 + turn)
-        size = float(rng.uniform(0.09, 0.22))
+        other = make_object(KINDS[(turn + 3) % len(KINDS)], 2000 + turn)
+        size, other_size = (float(x) for x in rng.uniform(0.09, 0.22, 2))
         queries = []
         for k in range(PER_REFERENCE):
-            scene = make_scene([mesh], seed=10_000 * seed + PER_REFERENCE * turn + k, sizes=[size], clutter=3)
+            number = 10_000 * seed + PER_REFERENCE * turn + k
+            scene = make_scene([mesh, other], seed=number, sizes=[size, other_size], clutter=2)
             if scene.masks[0].sum() < 400:
                 continue
             pose = scene.camera_from_object[0]
             rotation, translation = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation))
-            queries.append(
-                Shot(f"scene {k}", scene.rgb, scene.depth, scene.masks[0], scene.matrix, rotation, translation)
-            )
+            mask, beside = scene.masks
+            shot = Shot(f"scene {k}", scene.rgb, scene.depth, mask, scene.matrix, rotation, translation)
+            told = made and k < ABSENT and beside.sum() >= 400
+            queries.append(dataclasses.replace(shot, other=beside if told else None))
         if not queries:
             continue
         # One reference for several queries: its angle to the first is drawn, those to the others come of themselves.
@@ -155,8 +167,10 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0) -> Iterator[G
         rgb = np.where(mask[..., None], drawn.rgb[0], 128).astype(np.uint8)
         depth = _sense(rng, np.where(mask, drawn.depth[0], 2.0), lens, Sensor())
         reference = Shot("photo", _expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rotation, translation)
-        model = Model(mesh.vertices[np.unique(mesh.faces)] * size, size, *none)
-        yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries)
+        points = mesh.vertices[np.unique(mesh.faces)] * size
+        chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
+        model = Model(points[chosen], size, *none)
+        yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries, made)
 
 
 def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
@@ -168,10 +182,11 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
-def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> None:
+def run(groups: Iterator[Group], output: Path, config, limit: int | None, weights: str | None = None) -> None:
     """Try every pair by every method; lines already in ``output`` are not tried again."""
     import jax.numpy as jnp
 
+    from ipjax.cli import _use_cache
     from ipjax.host.estimation import Estimator
     from ipjax.host.foreground import Photo
     from ipjax.host.onboarding import onboard
@@ -182,7 +197,9 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> Non
     done = set()
     if output.exists():
         done = {tuple(json.loads(line)["key"]) for line in output.read_text().splitlines()}
-    encoder = load_encoder()
+    _use_cache()
+    encoder = load_encoder(weights)
+    everything = Estimator([], encoder)
     scans: dict[str, tuple] = {}
     tried = 0
     with output.open("a") as file:
@@ -190,6 +207,8 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> Non
             for method in METHODS:
                 left = len(group.queries) if limit is None else min(limit - tried, len(group.queries))
                 queries = group.queries[: max(left, 0)]
+                if method == "scan":
+                    queries = queries[: SCANS if group.made else 0]
                 keys = [(method, group.object, group.reference.name, query.name) for query in queries]
                 if all(key in done for key in keys):
                     continue
@@ -205,7 +224,8 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> Non
                         if group.object not in scans:
                             unit = group.metres_per_unit
                             mesh = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
-                            scans = {group.object: onboard(mesh, encoder, config, metres_per_unit=unit, progress=False)}
+                            found = onboard(mesh, encoder, config, metres_per_unit=unit, progress=False)
+                            scans[group.object] = found
                         made = scans[group.object]
                     else:
                         depth = {"depth": ref.depth} if method == "rgbd" else {}
@@ -223,7 +243,9 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> Non
                 except ValueError as error:
                     trouble = str(error)
                 onboarding = time.perf_counter() - start
-                estimator = None if made is None else Estimator([made], encoder)
+                # One estimator for all: it compiles once for each shape of templates.
+                everything.objects = [] if made is None else [made]
+                estimator = None if made is None else everything
                 for key, query in zip(keys, queries, strict=True):
                     if key in done:
                         continue
@@ -232,6 +254,8 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None) -> Non
                     if estimator is not None:
                         row |= judge(group, method, estimator, query)
                     row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
+                    if estimator is not None and query.other is not None:
+                        row["absent"] = look_elsewhere(estimator, query)
                     file.write(json.dumps(row) + "\n")
                     file.flush()
                     told = f"ADD-S {row['add_s']:.3f}, {row['rotation']:.0f}°" if "add_s" in row else row["trouble"]
@@ -254,9 +278,11 @@ def judge(group: Group, method: str, estimator, query: Shot) -> dict:
     except ValueError as error:
         return {"trouble": str(error)}
     result = estimator.run(0, *crop, diameter=info.measured_diameter)
-    if not bool(result.estimate.success):
+    estimate = result.estimate
+    if not bool(estimate.success):
         return {"trouble": "no pose found"}
-    found = result.estimate.camera_from_object
+
+    found = estimate.camera_from_object
     if method == "scan":
         rotation, translation, scale = compose(found, info.object_from_mesh)
         scale = scale / group.metres_per_unit  # metres per metre of the model
@@ -279,13 +305,46 @@ def judge(group: Group, method: str, estimator, query: Shot) -> dict:
     mssd, mspd = float(errors.mssd[0]) / model.diameter, float(errors.mspd[0]) * 640 / query.rgb.shape[1]
     return {
         "add_s": float(nearest),
+        "add": float(np.linalg.norm(mine - truth, axis=-1).mean()) / model.diameter,
         "rotation": float(np.degrees(errors.rotation[0])),
         "translation_mm": float(1e3 * np.linalg.norm(moved)),
         "scale": float(scale),
         "mssd_recall": float(np.mean(mssd < steps)),
         "mspd_recall": float(np.mean(mspd < 100 * steps)),
-        "confidence": float(result.estimate.confidence),
+        **certainty(estimate),
+        "surprise": surprise(rotation @ query.rotation.T, moved, np.asarray(estimate.covariance, np.float64)),
+        "independent": float(estimator.config.confidence.independent),
+        "scale_free": info.measured_diameter is None,
+        "scale_surprise": float((scale - 1) * found.scale / scale / max(float(estimate.scale_std), 1e-9)),
     }
+
+
+def certainty(estimate) -> dict:
+    """What an estimate says of itself."""
+    parts = estimate.agreement
+    return {
+        "confidence": float(estimate.confidence),
+        "agreement": [float(x) for x in (parts.depth, parts.features, parts.drawn, parts.rival)],
+        "ambiguity_deg": float(np.degrees(np.linalg.norm(np.asarray(estimate.ambiguity)))),
+    }
+
+
+def surprise(turn: np.ndarray, moved: np.ndarray, covariance: np.ndarray) -> float:
+    """The squared Mahalanobis length of an error in rotation and translation: six on average if all is right."""
+    from scipy.spatial.transform import Rotation
+
+    error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), moved])
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def look_elsewhere(estimator, query: Shot) -> dict:
+    """The same search behind another object's mask."""
+    try:
+        crop = estimator.frame(0, query.rgb, query.depth, query.other, query.K)
+    except ValueError as error:
+        return {"trouble": str(error)}
+    result = estimator.run(0, *crop, diameter=estimator.objects[0][1].measured_diameter)
+    return certainty(result.estimate) if bool(result.estimate.success) else {"trouble": "no pose found"}
 
 
 def table(rows: list[dict]) -> str:
@@ -313,6 +372,27 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
+def write_page(path: Path, text: str) -> None:
+    """The tables with what they rest on."""
+    from benchmarks.measure import commit, describe_device
+    from ipjax.host.bop import write_atomically
+
+    device = describe_device()
+    head = [
+        "# Objects from one photo",
+        "",
+        "Made by `python -m benchmarks.photo_pairs`; do not edit by hand. Each object is made from one masked photo "
+        "(`rgb`: its outline inflated, size unknown; `rgbd`: its depth completed, size known) or from the true mesh "
+        "(`scan`, the upper bound), and found in another RGB-D frame with a given mask. Angles are between the two "
+        "views of the object. The photo's true pose gives the canonical frame. Pairs where nothing was found count as "
+        "misses; medians are of those found; MSSD and MSPD recalls are means over BOP's ten thresholds.",
+        "",
+        f"{device['device']}, {device['cores']} cores, jax {device['jax']}, Python {device['python']}, "
+        f"commit {commit()}.",
+    ]
+    write_atomically(path, "\n".join(head) + "\n\n" + text + "\n")
+
+
 def main() -> None:
     """See the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -321,13 +401,19 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="a BOP data set: frames for ycbv, scans for synthetic")
     parser.add_argument("--output", type=Path, help="lines of JSON (default build/photo_pairs_WHAT.jsonl)")
     parser.add_argument("--pairs", type=int, default=200)
+    parser.add_argument("--page", type=Path, help="with table: write it here, too, with where it comes from")
     parser.add_argument("--limit", type=int, help="stop after so many pairs")
     parser.add_argument("--directions", type=int, default=24)
     parser.add_argument("--rolls", type=int, default=8)
+    parser.add_argument("--weights", help="of the encoder (default: the best that is here)")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.what == "table":
-        print(table([json.loads(line) for path in options.results for line in path.read_text().splitlines()]))
+        read = lambda path: [json.loads(line) for line in path.read_text().splitlines()]
+        text = "\n\n".join(f"## {path.stem}\n\n{table(read(path))}" for path in options.results)
+        print(text)
+        if options.page:
+            write_page(options.page, text)
         return
     from ipjax.config import OnboardConfig
 
@@ -340,7 +426,13 @@ def main() -> None:
     else:
         groups = synthetic_groups(options.pairs, options.data, options.seed)
     start = time.perf_counter()
-    run(groups, output, OnboardConfig(directions=options.directions, rolls=options.rolls), options.limit)
+    run(
+        groups,
+        output,
+        OnboardConfig(directions=options.directions, rolls=options.rolls),
+        options.limit,
+        options.weights,
+    )
     rows = [json.loads(line) for line in output.read_text().splitlines()]
     print(f"\n{options.directions} × {options.rolls} templates; this run took {time.perf_counter() - start:.0f} s\n")
     print(table(rows))

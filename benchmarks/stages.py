@@ -47,6 +47,7 @@ def rows(quick: bool):
             (f"refine, {poses.scale.shape[0]} hypotheses", fewer): (refine_all, (small, query, poses, Config())),
             (f"score, {poses.scale.shape[0]} hypotheses", fewer): (score_all, (small, query, poses, Config())),
             ("estimate, Config.paper()", size): (estimate, (templates, query, key, Config.paper())),
+            ("estimate, Config.fast(), compact templates", fewer): (estimate, (small, query, key, Config.fast())),
             ("estimate, Config(), compact templates", fewer): (estimate, (small, query, key, Config())),
         },
         repeats,

@@ -3,7 +3,16 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from ipjax.config import AlignConfig, Config, DescribeConfig, MatchConfig, OnboardConfig, RefineConfig, ScoreConfig
+from ipjax.config import (
+    AlignConfig,
+    ConfidenceConfig,
+    Config,
+    DescribeConfig,
+    MatchConfig,
+    OnboardConfig,
+    RefineConfig,
+    ScoreConfig,
+)
 from ipjax.features import describe, observe
 from ipjax.pipeline import estimate
 from ipjax.types import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
@@ -19,6 +28,7 @@ __version__ = "0.1.0"
 __all__ = [
     "AlignConfig",
     "Camera",
+    "ConfidenceConfig",
     "Config",
     "DescribeConfig",
     "MatchConfig",

@@ -313,7 +313,12 @@ measured is kept; --size says another, --free-size lets it be found.
     size.add_argument("--diameter", type=float, metavar="METRES", help="the same in metres")
     size.add_argument("--free-size", action="store_true", help="find the size even where the reference photo told it")
     parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
-    parser.add_argument("--method", choices=("best", "paper"), default="best", help="settings (default: best)")
+    parser.add_argument(
+        "--method",
+        choices=("best", "fast", "paper"),
+        default="best",
+        help="settings: the surest, the fastest, or the paper's",
+    )
     parser.add_argument("--seed", type=int, default=0, help="same seed, same answer (default 0)")
     parser.add_argument("-o", "--output", type=Path, metavar="JSON", help="where the poses go (default: the screen)")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="a picture of the result (with --frames: a folder)")
@@ -367,7 +372,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
     from ipjax.host.estimation import Estimator
     from ipjax.host.reports import CONVENTIONS, tell_estimate, to_json, write_text
 
-    config = Config.paper() if arguments.method == "paper" else Config()
+    config = Config.named("default" if arguments.method == "best" else arguments.method)
     estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
     # A reference photo with depth has measured the size; else it is free, unless the user knows it.
     diameters = [
@@ -437,18 +442,24 @@ def _estimate(arguments: argparse.Namespace) -> int:
         sys.stdout.write(text)
     else:
         write_text(arguments.output, text)
-    found = [one["success"] for entry in told for one in entry.get("objects", ())]
+    found = [one["present"] for entry in told for one in entry.get("objects", ())]
     return 0 if any(found) else 1
 
 
 def _summary(frame: str, one: dict[str, Any]) -> str:
     if not one["success"]:
         return f"{frame}: {one['object']}: no pose found"
+    from ipjax.host.reports import UNSURE_TURN
+
+    turn = one["least_certain_turn"]["std_deg"]
+    ending = f"; may be turned (± {turn:.0f}° about one axis)" if turn > UNSURE_TURN else ""
+    if not one["present"]:
+        ending += "; NOT HERE, or not seen well enough: the pose is a guess"
     x, y, z = (1e3 * v for v in one["camera_from_object"]["translation_m"])
     diameter = one["size_mm"]["diameter"]
     return (
-        f"{frame}: {one['object']}: centre ({x:.0f}, {y:.0f}, {z:.0f}) mm, diameter {diameter:.1f} mm, "
-        f"{one['inliers']} inliers, confidence {one['confidence']:.2f}"
+        f"{frame}: {one['object']}: centre ({x:.0f}, {y:.0f}, {z:.0f}) mm, diameter {diameter:.1f} ± "
+        f"{one['size_mm']['diameter_std']:.1f} mm, {one['inliers']} inliers, confidence {one['confidence']:.2f}{ending}"
     )
 
 
@@ -743,7 +754,7 @@ state of the code, are not continued; --restart begins anew.
     parser.add_argument("--split", default="test", help="which split (default test)")
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only these objects")
-    parser.add_argument("--config", default="default", metavar="paper|default|FILE", help="settings; FILE is JSON")
+    parser.add_argument("--config", default="default", metavar="default|fast|paper|FILE", help="settings; FILE is JSON")
     parser.add_argument(
         "--mesh-quality", type=int, default=0, choices=range(5), help="degrade the models first: 1 … 4 (default 0: not)"
     )
@@ -879,7 +890,7 @@ examples:
     )
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True)
     parser.add_argument("--batch", type=_positive, help="queries at once (default: one, without a batch axis)")
-    parser.add_argument("--config", choices=("default", "paper"), default="default")
+    parser.add_argument("--config", choices=("default", "fast", "paper"), default="default")
 
 
 def _export(arguments: argparse.Namespace) -> int:
@@ -889,7 +900,7 @@ def _export(arguments: argparse.Namespace) -> int:
 
     output = _check_output(arguments.output, (".stablehlo",))
     templates, info = load(arguments.object)
-    config = Config.paper() if arguments.config == "paper" else Config()
+    config = Config.named(arguments.config)
     export(templates, blank_query(templates, info.resolution), output, config, batch=arguments.batch)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; its inputs and outputs: {output}.json")
     return 0

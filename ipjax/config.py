@@ -72,6 +72,17 @@ class ScoreConfig(eqx.Module):
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
 
+class ConfidenceConfig(eqx.Module):
+    """From agreement to a probability and a covariance; most of it fitted by ``python -m benchmarks.calibration``."""
+
+    drawn: tuple[float, float, float, float, float] = (7.87, 0.59, 2.02, 5.42, -6.02)  # see ``confidence.probability``
+    undrawn: tuple[float, float, float, float, float] = (8.63, 1.02, 6.20, 0.0, -6.83)  # where no candidate was drawn
+    least: float = 0.5  # confidence below which the object is not here, or not seen well enough
+    independent: float = 46.0  # independent residuals of refinement
+    pair_share: float = 0.11  # of the pairs that are independent
+    tie: float = 0.05  # how fast an alternative's weight falls with the share by which its score is lower; not fitted
+
+
 class Config(eqx.Module):
     """The settings of :func:`ipjax.estimate`."""
 
@@ -79,6 +90,27 @@ class Config(eqx.Module):
     align: AlignConfig = AlignConfig()
     refine: RefineConfig = RefineConfig()
     score: ScoreConfig = ScoreConfig()
+    confidence: ConfidenceConfig = ConfidenceConfig()
+
+    @staticmethod
+    def fast() -> "Config":
+        """Fewer hypotheses, none of them tried turned, and three drawn: less sure which way round things are."""
+        return Config(
+            match=MatchConfig(views=6),
+            align=AlignConfig(keep=1),
+            refine=RefineConfig(steps=8),
+            score=ScoreConfig(alternates=0, drawn=3),
+        )
+
+    @staticmethod
+    def named(name: str) -> "Config":
+        """One of the presets: ``default``, ``fast`` or ``paper``.
+
+        Raises ValueError: another name.
+        """
+        if name not in PRESETS:
+            raise ValueError(f"there are no settings {name!r}; there are {', '.join(PRESETS)}")
+        return {"default": Config, "fast": Config.fast, "paper": Config.paper}[name]()
 
     @staticmethod
     def paper() -> "Config":
@@ -98,6 +130,9 @@ class Config(eqx.Module):
             refine=RefineConfig(steps=0),
             score=ScoreConfig(ranking="inliers"),
         )
+
+
+PRESETS = ("default", "fast", "paper")
 
 
 class OnboardConfig(eqx.Module):

@@ -10,12 +10,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ipjax.alignment import align
+from ipjax.confidence import covariance, find_rival, loosest_turn, pair_information, probability
 from ipjax.config import Config
 from ipjax.features import lift, object_features
 from ipjax.matching import match, select
-from ipjax.refinement import Cloud, refine, trace_contour
-from ipjax.scoring import depth_agreement, drawn_agreement, feature_agreement, score
-from ipjax.types import Camera, Hypotheses, Patches, PoseEstimate, Query, Similarity, Templates
+from ipjax.refinement import Cloud, information, refine, trace_contour
+from ipjax.scoring import score
+from ipjax.types import Agreement, Camera, Hypotheses, Patches, PoseEstimate, Query, Similarity, Templates
 
 
 def estimate(
@@ -54,35 +55,67 @@ def estimate(
     query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
-        poses, agreement, _, determined = align(pairs, size, key, config.align, diameter=diameter)
+        poses, score, _, determined = align(pairs, size, key, config.align, diameter=diameter)
+    scale_known = diameter is not None
+    scene = _Scene(query, config.score.resolution, config.refine.silhouette)
     parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
+    nothing = Agreement(*[jnp.zeros_like(score)] * 4)
+    found = _Candidates(poses, parent, determined, jnp.where(determined, score, -1), nothing)
+    drawing = encoder is not None and templates.appearance is not None and config.score.drawn > 0
     if config.score.ranking == "render":
-        scene = _Scene(query, config.score.resolution, config.refine.silhouette)
-        poses, parent, determined, agreement = _rounds(
-            templates, query, scene, (poses, parent, determined), config, scale_known=diameter is not None
-        )
-        if encoder is not None and templates.appearance is not None and config.score.drawn:
-            poses, parent, determined, agreement = _draw_best(
-                encoder, templates, query, scene, (poses, parent, determined, agreement), config
-            )
-    agreement = jnp.where(determined, agreement, -1)
-    agreement, order = lax.top_k(agreement, agreement.shape[0])
-    poses, parent, determined = jax.tree.map(lambda x: x[order], (poses, parent, determined))
-    answer: Similarity = jax.tree.map(lambda x: x[0], poses)
-    offset = answer @ pairs.object[parent[0]] - pairs.camera[parent[0]]
+        found = _rounds(templates, query, scene, found, config, scale_known=scale_known)
+        if drawing:
+            found = _draw_best(encoder, templates, query, scene, found, config)
+    found = jax.tree.map(lambda x: x[lax.top_k(found.score, found.score.shape[0])[1]], found)
+    best = jax.tree.map(lambda x: x[0], found)
+    offset = best.poses @ pairs.object[best.parent] - pairs.camera[best.parent]
     squared = jnp.sum(offset**2, axis=-1)
-    used = (pairs.weight[parent[0]] > 0) & (squared < (config.align.threshold * answer.scale) ** 2) & determined[0]
+    near = squared < (config.align.threshold * best.poses.scale) ** 2
+    used = (pairs.weight[best.parent] > 0) & near & best.determined
     count = jnp.sum(used)
+    with jax.named_scope("confidence"):
+        agreement = eqx.tree_at(lambda a: a.rival, best.agreement, find_rival(found.poses, found.score))
+        if config.score.ranking == "render":
+            weights = config.confidence.drawn if drawing else config.confidence.undrawn
+            weights = jnp.stack([jnp.asarray(x, score.dtype) for x in weights])
+            confidence = jnp.where(best.determined, probability(agreement, weights), 0)
+            present = best.determined & (confidence >= config.confidence.least)
+        else:  # the share of pairs that agree is no probability
+            confidence, present = jnp.clip(best.score, 0, 1), best.determined
+        matched = jax.tree.map(lambda x: x[best.parent], pairs)
+        spread, scale_std = covariance(
+            information(templates.surface, scene.cloud, best.poses, config.refine),
+            pair_information(best.poses, matched, used),
+            best.poses.scale,
+            config.confidence,
+            scale_known=scale_known,
+        )
+        ambiguity = loosest_turn(found.poses, found.score, spread[:3, :3], config.confidence)
     return PoseEstimate(
-        camera_from_object=answer,
-        confidence=jnp.clip(agreement[0], 0, 1),
-        hypotheses=Hypotheses(poses, jnp.clip(agreement, 0, 1)),
-        view=matches.view[parent[0]],
+        camera_from_object=best.poses,
+        confidence=confidence,
+        present=present,
+        covariance=spread,
+        scale_std=scale_std,
+        ambiguity=ambiguity,
+        agreement=agreement,
+        hypotheses=Hypotheses(found.poses, jnp.clip(found.score, 0, 1)),
+        view=matches.view[best.parent],
         view_score=matches.ranking,
         inliers=count,
         rmse=jnp.sqrt(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
-        success=determined[0],
+        success=best.determined,
     )
+
+
+class _Candidates(eqx.Module):
+    """Poses on their way through refinement, scores and drawing."""
+
+    poses: Similarity
+    parent: Int[Array, "*n"]  # the template, among those kept, whose pairs led here
+    determined: Bool[Array, "*n"]
+    score: Float[Array, "*n"]  # -1 = absent
+    agreement: Agreement
 
 
 def _check_shapes(templates: Templates, query: Query) -> None:
@@ -128,55 +161,36 @@ def _extent(mask: Bool[Array, "h w"], depth: Float[Array, "h w"], camera: Camera
 
 
 def _rounds(
-    templates: Templates,
-    query: Query,
-    scene: _Scene,
-    first: tuple[Similarity, Int[Array, "h"], Bool[Array, "h"]],
-    config: Config,
-    *,
-    scale_known: bool,
-) -> tuple[Similarity, Int[Array, "n"], Bool[Array, "n"], Float[Array, "n"]]:
+    templates: Templates, query: Query, scene: _Scene, first: _Candidates, config: Config, *, scale_known: bool
+) -> _Candidates:
     """Refine and score the hypotheses; then do the same with the best of them turned about the box's axes.
 
     Both rounds are one body of a scan, so that refinement is compiled once; the shorter one is padded with copies.
     """
     turned = config.score.alternates
-    count = max(first[2].shape[0], TURNS * turned)
+    count = max(first.score.shape[0], TURNS * turned)
     pad = lambda x: jnp.concatenate([x, jnp.repeat(x[:1], count - x.shape[0], axis=0)])
-
     absent = lambda flags: jnp.pad(flags, (0, count - flags.shape[0]))  # copies are no hypotheses of their own
-    poses, parent, determined = first
 
     def one_round(given, _):
         poses, parent, determined = given
-        poses, score = _improve_and_score(templates, query, scene, poses, config, scale_known=scale_known)
-        score = jnp.where(determined, score, -1)
+        poses, score, agreement = _improve_and_score(templates, query, scene, poses, config, scale_known=scale_known)
+        found = _Candidates(poses, parent, determined, jnp.where(determined, score, -1), agreement)
         if not turned:
-            return given, (poses, parent, determined, score)
-        best = lax.top_k(score, turned)[1]
-        again = lambda x: pad(jnp.repeat(x[best], TURNS, axis=0))
+            return given, found
+        best = lax.top_k(found.score, turned)[1]
+        again = lambda x: jnp.repeat(x[best], TURNS, axis=0)
         alternates = jax.tree.map(pad, turn(jax.tree.map(lambda x: x[best], poses), templates.axes))
-        return (alternates, again(parent), absent(jnp.repeat(determined[best], TURNS))), (
-            poses,
-            parent,
-            determined,
-            score,
-        )
+        return (alternates, pad(again(parent)), absent(again(determined))), found
 
-    start = (jax.tree.map(pad, poses), pad(parent), absent(determined))
+    start = (jax.tree.map(pad, first.poses), pad(first.parent), absent(first.determined))
     _, found = lax.scan(one_round, start, None, length=2 if turned else 1)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
 
 def _improve_and_score(
-    templates: Templates,
-    query: Query,
-    scene: _Scene,
-    poses: Similarity,
-    config: Config,
-    *,
-    scale_known: bool,
-) -> tuple[Similarity, Float[Array, "h"]]:
+    templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config, *, scale_known: bool
+) -> tuple[Similarity, Float[Array, "h"], Agreement]:
     if config.refine.steps:
         with jax.named_scope("refine"):
             fit = lambda pose: refine(templates.surface, scene.cloud, pose, config.refine, scale_known=scale_known)[0]
@@ -184,32 +198,28 @@ def _improve_and_score(
     with jax.named_scope("score"):
         camera = scene.cloud.camera
         rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score)
-        return poses, jax.vmap(rate)(poses)
+        return poses, *jax.vmap(rate)(poses)
 
 
 def _draw_best(
-    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
     templates: Templates,
     query: Query,
     scene: _Scene,
-    found: tuple[Similarity, Int[Array, "n"], Bool[Array, "n"], Float[Array, "n"]],
+    found: _Candidates,
     config: Config,
-) -> tuple[Similarity, Int[Array, "k"], Bool[Array, "k"], Float[Array, "k"]]:
+) -> _Candidates:
     """The best candidates, each different from the others, scored by what they look like, too."""
-    poses, _, determined, agreement = found
-    agreement = jnp.where(determined, agreement, -1)
-    chosen, ahead = distinct(poses, agreement, min(config.score.drawn, agreement.shape[0]), config.score.apart)
-    poses, parent, determined, _ = jax.tree.map(lambda x: x[chosen], found)
-
-    def rate(pose):
-        depth = depth_agreement(templates.surface, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
-        features = feature_agreement(templates, query, pose, config.score)
-        return depth * features * drawn_agreement(encoder, templates, query, pose, config.score)
-
+    count = min(config.score.drawn, found.score.shape[0])
+    chosen, ahead = distinct(found.poses, found.score, count, config.score.apart)
+    kept = jax.tree.map(lambda x: x[chosen], found)
+    camera = scene.cloud.camera
+    rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score, encoder=encoder)
     with jax.named_scope("draw"):
         # One image at a time is fastest on a CPU; accelerators want them all.
-        score = lax.platform_dependent(poses, cpu=lambda p: lax.map(rate, p), default=jax.vmap(rate))
-    return poses, parent, determined & ahead, score
+        rated, agreement = lax.platform_dependent(kept.poses, cpu=lambda p: lax.map(rate, p), default=jax.vmap(rate))
+    determined = kept.determined & ahead
+    return _Candidates(kept.poses, kept.parent, determined, jnp.where(determined, rated, -1), agreement)
 
 
 def distinct(

@@ -10,10 +10,12 @@ import functools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
+from ipjax_kernels.positive import solve_positive
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
@@ -105,18 +107,12 @@ def refine(
     Returns:
       The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1].
     """
-    points = surface.points[: config.points]
-    normals = surface.normals[: config.points]
-    trust = 0.25 + 0.75 * surface.seen[: config.points]
     start = camera_from_object
-    weight = jnp.asarray(config.silhouette_weight, start.translation.dtype)
 
     def residuals(step, _):
-        moved = retract(start, step)
-        terms = [*_depth_terms(moved, points, normals, trust, cloud, config)]
-        terms.append(_silhouette(moved, surface.points, cloud, config) * jnp.sqrt(weight))
-        together = jnp.concatenate(terms)
-        return together * jnp.sqrt(together.shape[0] / (2 + weight))  # so that the mean square is in [0, 1]
+        together = _residuals(retract(start, step), surface, cloud, config)
+        # So that the mean square is in [0, 1].
+        return together * jnp.sqrt(together.shape[0] / (2 + jnp.asarray(config.silhouette_weight, together.dtype)))
 
     count = 6 if scale_known else 7
     zero = jnp.zeros(count, start.translation.dtype)
@@ -127,6 +123,19 @@ def refine(
     better = jnp.isfinite(after) & (after < before)
     step = jnp.where(better, solution.value, zero)
     return retract(start, step), jnp.where(better, after, before)
+
+
+def information(
+    surface: Surface, cloud: Cloud, camera_from_object: Similarity, config: RefineConfig = RefineConfig()
+) -> tuple[Float[Array, "7 7"], Float[Array, ""]]:
+    """JᵀJ of the residuals at a pose, over the tangent of :func:`retract`, and their sum of squares.
+
+    Each kind of residual (surface to depth, depth to surface, silhouette) is averaged: their number does not matter.
+    """
+    zero = jnp.zeros(7, camera_from_object.translation.dtype)
+    residuals = lambda step: _residuals(retract(camera_from_object, step), surface, cloud, config)
+    slopes = jax.jacfwd(residuals)(zero)
+    return jnp.sum(slopes[:, :, None] * slopes[:, None, :], axis=0), jnp.sum(residuals(zero) ** 2)
 
 
 def retract(start: Similarity, step: Float[Array, "n"]) -> Similarity:
@@ -150,6 +159,15 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
     outer = vector[:, None] * vector[None, :]
     return jnp.eye(3, dtype=vector.dtype) * (1 - cosine * squared) + sine * cross + cosine * outer
+
+
+def _residuals(moved, surface, cloud, config):
+    """All terms; the squares of each kind sum to at most its weight."""
+    points, normals = surface.points[: config.points], surface.normals[: config.points]
+    trust = 0.25 + 0.75 * surface.seen[: config.points]
+    weight = jnp.asarray(config.silhouette_weight, moved.translation.dtype)
+    silhouette = _silhouette(moved, surface.points, cloud, config) * jnp.sqrt(weight)
+    return jnp.concatenate([*_depth_terms(moved, points, normals, trust, cloud, config), silhouette])
 
 
 def _depth_terms(moved, points, normals, trust, cloud, config):
@@ -288,26 +306,3 @@ class NormalCholesky(lx.AbstractLinearSolver):
 
     def assume_full_rank(self) -> bool:
         return True
-
-
-def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Solve a small symmetric positive-definite system by LDLᵀ, unrolled; singular directions get a zero."""
-    size = matrix.shape[0]
-    floor = 1e-9 * jnp.max(jnp.abs(matrix)) + 1e-30
-    lower: list[list[Array]] = []
-    pivots: list[Array] = []
-    for row in range(size):
-        entries: list[Array] = []
-        for column in range(row):
-            inner = sum(entries[k] * lower[column][k] * pivots[k] for k in range(column))
-            entries.append((matrix[row, column] - inner) / pivots[column])
-        pivots.append(jnp.maximum(matrix[row, row] - sum(entries[k] ** 2 * pivots[k] for k in range(row)), floor))
-        lower.append(entries)
-    forward: list[Array] = []
-    for row in range(size):
-        forward.append(right[row] - sum(lower[row][k] * forward[k] for k in range(row)))
-    solution: list[Array] = [right[0]] * size
-    for row in reversed(range(size)):
-        rest = sum(lower[k][row] * solution[k] for k in range(row + 1, size))
-        solution[row] = forward[row] / pivots[row] - rest
-    return jnp.stack(solution)

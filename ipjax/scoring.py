@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from ipjax.cameras import project
 from ipjax.config import ScoreConfig
 from ipjax.features import object_features
-from ipjax.types import Camera, Patches, Query, Similarity, Surface, Templates
+from ipjax.types import Agreement, Camera, Patches, Query, Similarity, Surface, Templates
 
 
 def score(
@@ -27,16 +27,25 @@ def score(
     camera: Camera,
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
-) -> Float[Array, ""]:
-    """The score in [0, 1] of one hypothesis; the caller vmaps.
+    *,
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None = None,
+) -> tuple[Float[Array, ""], Agreement]:
+    """The score in [0, 1] of one hypothesis, and its parts; the caller vmaps.
 
     Args:
       query: its patches centred on the templates' mean, as the templates' are.
       depth, mask, camera: the query's crop on a coarse grid (metres, 0 = unknown; one pixel per cell).
+      encoder: with it the hypothesis is drawn and described, too.
     """
     geometry = depth_agreement(templates.surface, depth, mask, camera, camera_from_object, config)
     features = feature_agreement(templates, query, camera_from_object, config)
-    return geometry * features**config.power
+    if encoder is None:
+        drawn = jnp.ones_like(geometry)
+        total = geometry * features**config.power
+    else:
+        drawn = drawn_agreement(encoder, templates, query, camera_from_object, config)
+        total = geometry * features * drawn
+    return total, Agreement(geometry, features, drawn, jnp.zeros_like(geometry))
 
 
 def depth_agreement(

@@ -118,11 +118,26 @@ class Hypotheses(eqx.Module):
     score: Float[Array, "*b h"]  # higher is better; [0, 1]
 
 
+class Agreement(eqx.Module):
+    """How well a pose explains the query, part by part; each in [0, 1]."""
+
+    depth: Float[Array, "*b"]  # share of what is seen whose depth agrees
+    features: Float[Array, "*b"]  # cosine of the nearest templates' patches, carried into the query
+    drawn: Float[Array, "*b"]  # cosine of the object drawn there and described; 1 where it was not drawn
+    rival: Float[Array, "*b"]  # score of the best pose that differs from this one, as a share of this one's
+
+
 class PoseEstimate(eqx.Module):
     """The answer, and what it rests on."""
 
     camera_from_object: Similarity  # metres from model units; the scale is the object's diameter in metres
-    confidence: Float[Array, "*b"]  # [0, 1]: how much of what is seen the pose explains; not a calibrated probability
+    confidence: Float[Array, "*b"]  # [0, 1]: the probability that the pose is right (``confidence.probability``);
+    # where candidates are not scored (the paper's method) the share of pairs that agree
+    present: Bool[Array, "*b"]  # confident enough that the object is here; without it the pose is a guess
+    covariance: Float[Array, "*b 6 6"]  # of rotation (rad, about the object's centre) and translation (m), camera axes
+    scale_std: Float[Array, "*b"]  # standard deviation of the scale, metres; 0 where the size was given
+    ambiguity: Float[Array, "*b 3"]  # the object's axis about which the rotation is least certain; length = std in rad
+    agreement: Agreement  # what the confidence rests on
     hypotheses: Hypotheses  # the alternatives, the answer first
     view: Int[Array, "*b"]  # the template whose pairs led to the answer
     view_score: Float[Array, "*b v"]  # of every template; higher is better

@@ -6,10 +6,13 @@ import sys
 from pathlib import Path
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from benchmarks import table
+from benchmarks import ablation, calibration, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
+from ipjax.config import ConfidenceConfig, Config
+from ipjax.host.studies import describe_config, read_config
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = {
@@ -77,3 +80,57 @@ def test_a_quick_run_writes_its_rows(tmp_path):
         assert row["runs"] == 7 and 0 < row["fastest_ms"] <= row["median_ms"]
         assert row["temporary_bytes"] >= 0 and row["compile_s"] > 0
     assert "| umeyama |" in done.stdout and "s in all" in done.stdout
+
+
+def test_the_ablation_goes_from_the_paper_to_the_default(tmp_path):
+    steps = []
+    for name, changes in ablation.STEPS.items():
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(changes))
+        steps.append(read_config(path))
+    assert steps[0] == Config.paper() and steps[-1] == Config()
+    assert len({str(describe_config(step)) for step in steps}) == len(steps)
+
+
+def test_a_calibration_finds_the_odds_that_made_the_data():
+    rng = np.random.default_rng(0)
+    features = np.concatenate([np.ones((4000, 1)), rng.normal(size=(4000, 4))], axis=1)
+    true = np.array([0.5, 1.0, -2.0, 0.0, 0.7])
+    chance = calibration.chances(features, true)
+    right = rng.random(4000) < chance
+    found = calibration.fit_logistic(features, right)
+    np.testing.assert_allclose(found, true, atol=0.2)
+    error, rows = calibration.reliability(calibration.chances(features, found), right)
+    assert error < 0.03 and sum(count for _, _, count in rows) == 4000
+    assert calibration.reliability(np.full(100, 0.9), np.arange(100) < 50)[0] == pytest.approx(0.4)
+
+
+def make_row(turn: int, right: bool, *, surprise: float = 6.0) -> dict:
+    quality = 0.9 if right else 0.3
+    return {
+        "key": ["scan", f"{turn:04d} mug-{turn}", "photo", "scene 0"],
+        "agreement": [quality, quality, quality, 0.2],
+        "add": 0.02 if right else 0.5,
+        "surprise": surprise,
+        "scale_surprise": 0.5,
+        "scale_free": True,
+        "independent": 1.0,
+        "absent": {"agreement": [0.2, 0.1, 0.1, 0.9]},
+    }
+
+
+def test_objects_that_judge_are_not_those_that_fit(tmp_path):
+    path = tmp_path / "pairs.jsonl"
+    real = make_row(9, True) | {"key": ["scan", "0009 obj_000004", "photo", "scene 0"]}
+    rows = [make_row(turn, turn % 3 > 0) for turn in range(8)]
+    path.write_text("".join(json.dumps(row) + "\n" for row in [*rows, real]))
+    read = calibration.read([path])
+    assert len(read) == 8  # those of real data are left out
+    fit, held = calibration.split(read)
+    assert {r["key"][1] for r in fit}.isdisjoint(r["key"][1] for r in held) and len(fit) == len(held) == 4
+    features, right, there = calibration.cases(held)
+    assert features.shape == (8, 5) and there.sum() == 4 and not right[~there].any()
+    text, diagram = calibration.page(held, ConfidenceConfig())
+    assert "expected calibration error" in text and sum(count for *_, count in diagram) == 8
+    calibration.draw(diagram, tmp_path / "diagram.png")
+    assert (tmp_path / "diagram.png").stat().st_size > 1000

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from estimates import make_estimate
 from PIL import Image
 from test_objects import make_object, nan, rewrite
 
@@ -20,7 +21,7 @@ from ipjax.cameras import point_map
 from ipjax.features import describe
 from ipjax.host.objects import load, save
 from ipjax.host.reports import compose, tell_estimate, to_json
-from ipjax.types import Camera, Hypotheses, Patches, PoseEstimate, Similarity, Surface, Templates, View
+from ipjax.types import Camera, Patches, PoseEstimate, Similarity, Surface, Templates, View
 
 K = {"fx": 110.0, "fy": 108.0, "cx": 63.2, "cy": 47.4}
 
@@ -232,17 +233,7 @@ def estimate_of(info, rotation, translation, scale) -> PoseEstimate:
         jnp.asarray(scale * rotation @ centre + translation, jnp.float32),
         jnp.asarray(scale / info.mesh_scale, jnp.float32),
     )
-    many = Similarity(pose.rotation[None], pose.translation[None], pose.scale[None])
-    return PoseEstimate(
-        camera_from_object=pose,
-        confidence=jnp.asarray(0.8),
-        hypotheses=Hypotheses(many, jnp.asarray([0.8])),
-        view=jnp.asarray(1),
-        view_score=jnp.zeros(5),
-        inliers=jnp.asarray(12),
-        rmse=jnp.asarray(0.004),
-        success=jnp.asarray(True),
-    )
+    return make_estimate(pose)
 
 
 def test_the_pose_maps_the_users_mesh_to_camera_metres(case):
@@ -262,6 +253,8 @@ def test_the_pose_maps_the_users_mesh_to_camera_metres(case):
     np.testing.assert_allclose((scale * points) @ rigid[:3, :3].T + rigid[:3, 3], expected, atol=1e-6)
     assert told["size_mm"]["diameter"] == pytest.approx(1e3 * scale / info.mesh_scale, rel=1e-6)
     assert told["residual_rms_mm"] == pytest.approx(4.0) and told["inliers"] == 12
+    assert told["present"] and told["size_mm"]["diameter_std"] == pytest.approx(2.0)
+    assert np.diag(told["covariance"])[5] == pytest.approx(4e-6) and told["agreement"]["rival"] == pytest.approx(0.6)
     inner = Similarity(jnp.eye(3), jnp.zeros(3), jnp.asarray(1.0))
     np.testing.assert_allclose(compose(inner, info.object_from_mesh)[1], [-4.0, 8.0, -2.0])
 

@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
+from estimates import make_estimate
 from PIL import Image
 
 from ipjax.host.drawing import Evidence, draw, draw_overlay, silhouette, write_image
 from ipjax.host.objects import ObjectInfo
-from ipjax.types import Hypotheses, PoseEstimate, Similarity
+from ipjax.types import Similarity
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
@@ -19,21 +20,6 @@ INFO = ObjectInfo("ball", "none", vertices=np.asarray(BALL.vertices), faces=np.a
 
 def placed(x=0.0, y=0.0, z=1.0, scale=0.3) -> Similarity:
     return Similarity(jnp.eye(3), jnp.asarray([x, y, z], jnp.float32), jnp.asarray(scale, jnp.float32))
-
-
-def estimate(pose: Similarity, success=True) -> PoseEstimate:
-    return PoseEstimate(
-        camera_from_object=pose,
-        confidence=jnp.asarray(0.7),
-        hypotheses=Hypotheses(
-            Similarity(pose.rotation[None], pose.translation[None], pose.scale[None]), jnp.asarray([0.7])
-        ),
-        view=jnp.asarray(0),
-        view_score=jnp.zeros(3),
-        inliers=jnp.asarray(9),
-        rmse=jnp.asarray(0.002),
-        success=jnp.asarray(success),
-    )
 
 
 def test_the_silhouette_of_a_ball_is_its_disc():
@@ -85,21 +71,21 @@ def test_the_page_holds_photo_cards_and_pairs():
     crop = np.zeros((56, 56, 3), np.float32)
     points = rng.uniform(5, 50, (30, 2))
     proof = Evidence(crop, np.zeros((28, 28, 3), np.uint8), points, points / 56, np.arange(30) % 3 > 0)
-    page = draw(photo, K, estimate(placed()), INFO, proof, height=480)
+    page = draw(photo, K, make_estimate(placed()), INFO, proof, height=480)
     assert page.dtype == np.uint8 and page.shape[0] >= 480 and page.shape[1] > 640 + 500
     without = draw(
-        photo, K, estimate(placed()), INFO, dataclasses.replace(proof, inlier=np.zeros(30, bool)), height=480
+        photo, K, make_estimate(placed()), INFO, dataclasses.replace(proof, inlier=np.zeros(30, bool)), height=480
     )
     assert (page != without).any()
-    two = draw(photo, K, [estimate(placed()), estimate(placed(0.2))], [INFO, INFO], [proof, None], height=480)
+    two = draw(photo, K, [make_estimate(placed()), make_estimate(placed(0.2))], [INFO, INFO], [proof, None], height=480)
     assert two.shape[1] > page.shape[1] - 200
-    nothing = draw(photo, K, estimate(placed(), success=False), INFO, height=480)
+    nothing = draw(photo, K, make_estimate(placed(), success=False), INFO, height=480)
     np.testing.assert_array_equal(nothing[14:494, 14:654], draw_overlay(photo, K, [], [], height=480))
 
 
 def test_lists_of_different_length_are_refused():
     with pytest.raises(ValueError, match="2 objects"):
-        draw(np.zeros((24, 32, 3), np.uint8), K, estimate(placed()), [INFO, INFO])
+        draw(np.zeros((24, 32, 3), np.uint8), K, make_estimate(placed()), [INFO, INFO])
 
 
 def test_pictures_are_written_whole_or_not_at_all(tmp_path):
@@ -111,3 +97,12 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path):
     with pytest.raises(OSError):
         write_image(tmp_path / "none" / "a.png", picture)
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+def test_a_card_tells_of_doubt():
+    """An absent object and a loose turn each add a line to the card."""
+    photo = np.full((240, 320, 3), 90, np.uint8)
+    sure = draw(photo, K, make_estimate(placed()), INFO, height=480)
+    guess = draw(photo, K, make_estimate(placed(), present=False), INFO, height=480)
+    loose = draw(photo, K, make_estimate(placed(), turn=1.5), INFO, height=480)
+    assert (guess != sure).any() and (loose != sure).any()

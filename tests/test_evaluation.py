@@ -395,20 +395,23 @@ def test_settings_from_a_file(tmp_path):
     assert (config.match.views, config.match.cycle, config.align.scale_gate) == (4, 3.0, (0.1, 10.0))
     assert config.score == Config.paper().score
     assert studies.read_config("paper") == Config.paper() != studies.read_config("default") == Config()
+    assert studies.read_config("fast") == Config.fast() != Config()
+    with pytest.raises(ValueError, match="no settings 'slow'; there are default, fast, paper"):
+        Config.named("slow")
     for text, says in (
         ('{"match": {"view": 4}}', "match: no setting 'view'"),
         ('{"match": 4}', "match holds settings of its own"),
         ('{"match": {"views": "many"}}', "views is 8 by default"),
         ('{"align": {"count": true}}', "of another kind"),
-        ('{"from": "nowhere"}', "'from' is default or paper"),
+        ('{"from": "nowhere"}', "'from' is one of default, fast, paper, not 'nowhere'"),
         ("[1]", "a JSON object"),
         ("{", "no JSON"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=re.escape(says)):
             studies.read_config(path)
-    with pytest.raises(ValueError, match="neither paper, default nor a file"):
-        studies.read_config("fast")
+    with pytest.raises(ValueError, match="neither default, fast, paper nor a file"):
+        studies.read_config("slow")
 
 
 def test_settings_are_plain_json_even_where_they_are_infinite():

@@ -24,6 +24,7 @@ LAYERS = {
     "ipjax.alignment": 3,
     "ipjax.refinement": 3,
     "ipjax.scoring": 3,
+    "ipjax.confidence": 3,
     "ipjax.pipeline": 4,
     "ipjax.host": 5,
     "ipjax.cli": 6,

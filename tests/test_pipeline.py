@@ -72,7 +72,26 @@ def test_a_known_size_is_kept(templates):
     query, truth = problems.make_query(1)
     found = estimate(templates, query, jax.random.key(0), TURNED, truth.scale)
     np.testing.assert_allclose(found.camera_from_object.scale, truth.scale, rtol=1e-6)
+    assert float(found.scale_std) == 0
     assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.1 * float(truth.scale)
+
+
+def test_the_estimate_says_how_sure_it_is(templates):
+    query, truth = problems.make_query(1)
+    found = estimate(templates, query, jax.random.key(0), TINY)
+    spread = np.asarray(found.covariance, np.float64)
+    np.testing.assert_allclose(spread, spread.T, rtol=1e-4, atol=1e-9)
+    assert np.linalg.eigvalsh(spread).min() > 0
+    size = float(truth.scale)
+    assert np.sqrt(np.diag(spread)[3:]).max() < 0.5 * size and 0 < float(found.scale_std) < 0.5 * size
+    assert bool(found.present) == (float(found.confidence) >= TINY.confidence.least)
+    for part in (found.agreement.depth, found.agreement.features, found.agreement.drawn, found.agreement.rival):
+        assert 0 <= float(part) <= 1
+    # Half of the object hidden, and what is seen in noise: less is known.
+    poor, _ = problems.make_query(1, noise=1.5, occlusion=0.5)
+    worse = estimate(templates, poor, jax.random.key(0), TINY)
+    assert float(worse.confidence) < float(found.confidence)
+    assert np.trace(np.asarray(worse.covariance)[3:, 3:]) > np.trace(spread[3:, 3:])
 
 
 def test_the_same_key_gives_the_same_answer(templates):

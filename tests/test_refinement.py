@@ -16,7 +16,6 @@ from ipjax.refinement import (
     refine,
     retract,
     rotation_from_vector,
-    solve_positive,
     trace_contour,
 )
 from ipjax.types import Camera
@@ -156,20 +155,6 @@ def test_what_is_hidden_does_not_count(scene, side):
     found, _ = run(surface, hide(cloud, hidden), truth, CONFIG)
     assert abs(float(found.scale / truth.scale) - 1) < 0.03
     assert float(jnp.linalg.norm(found.translation - truth.translation)) < 0.03 * float(truth.scale)
-
-
-@given(seed=st.integers(0, 2**31))
-def test_small_systems_are_solved(seed):
-    rng = np.random.default_rng(seed)
-    factor = rng.normal(size=(20, 7))
-    matrix, right = factor.T @ factor, rng.normal(size=7)
-    found = jax.jit(solve_positive)(jnp.asarray(matrix, jnp.float32), jnp.asarray(right, jnp.float32))
-    np.testing.assert_allclose(matrix @ np.asarray(found, np.float64), right, atol=2e-3 * np.abs(right).max())
-
-
-def test_a_singular_system_gives_finite_numbers():
-    found = solve_positive(jnp.zeros((7, 7)), jnp.zeros(7))
-    assert bool(jnp.all(jnp.isfinite(found)))
 
 
 @given(seed=st.integers(0, 2**31), power=st.integers(-8, 0))

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ipjax.config import Config
 from ipjax.host.images import as_intrinsics
 from ipjax.host.objects import ObjectInfo
+from ipjax.host.reports import UNSURE_TURN
 from ipjax.matching import match
 from ipjax.pipeline import comparable
 from ipjax.types import PoseEstimate, Query, Similarity, Templates
@@ -313,6 +314,9 @@ def _card(estimate: PoseEstimate, info: ObjectInfo, proof: Evidence | None, colo
         return np.asarray(canvas)[: y + 40]
     confidence = float(estimate.confidence)
     good = (74, 222, 128) if confidence >= 0.6 else (251, 191, 36) if confidence >= 0.3 else (248, 113, 113)
+    if not bool(estimate.present):
+        pen.text((margin, y), "not here, or not seen well enough: a guess", (248, 113, 113), _font(16))
+        y += 26
     pen.text((margin, y), "confidence", _FAINT, _font(15))
     left, right = margin + 110, width - margin - 52
     pen.rounded_rectangle((left, y + 5, right, y + 15), 5, fill=_PAPER)
@@ -324,10 +328,13 @@ def _card(estimate: PoseEstimate, info: ObjectInfo, proof: Evidence | None, colo
     x, height_, z = (1e3 * float(v) for v in np.asarray(pose.translation))
     pairs = 0 if proof is None else len(proof.inlier)
     rows = [
-        ("diameter", f"{1e3 * float(pose.scale):.1f} mm"),
+        ("diameter", f"{1e3 * float(pose.scale):.1f} ± {1e3 * float(estimate.scale_std):.1f} mm"),
         ("centre in camera", f"({x:.0f}, {height_:.0f}, {z:.0f}) mm"),
         ("inliers", f"{int(estimate.inliers)} pairs, rms {1e3 * float(estimate.rmse):.1f} mm"),
     ]
+    turn = np.degrees(float(np.linalg.norm(np.asarray(estimate.ambiguity))))
+    if turn > UNSURE_TURN:
+        rows.append(("may be turned", f"± {turn:.0f}° about one axis"))
     if pairs:
         assert proof is not None
         rows.append(("pairs shown", f"{int(proof.inlier.sum())} of {pairs} agree with the pose"))

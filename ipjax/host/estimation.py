@@ -122,8 +122,11 @@ def _turn(camera_from_crop: Similarity, found: PoseEstimate) -> PoseEstimate:
         translation = np.asarray(pose.translation, np.float64) @ turn.T
         return Similarity(jnp.asarray(rotation, jnp.float32), jnp.asarray(translation, jnp.float32), pose.scale)
 
+    both = np.kron(np.eye(2), turn)
+    covariance = both @ np.asarray(found.covariance, np.float64) @ both.T
     return dataclasses.replace(
         found,
+        covariance=jnp.asarray(covariance, jnp.float32),
         camera_from_object=turned(found.camera_from_object),
         hypotheses=dataclasses.replace(
             found.hypotheses, camera_from_object=turned(found.hypotheses.camera_from_object)

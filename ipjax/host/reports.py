@@ -24,8 +24,14 @@ CONVENTIONS = {
     "similarity": "x_camera = scale * rotation @ x + translation; rotation row by row",
     "matrix": "4 x 4, row by row, [scale * rotation, translation; 0 0 0 1]: x_camera = matrix @ (x, 1)",
     "rigid_matrix": "4 x 4, row by row, [rotation, translation; 0 0 0 1]: x_camera = rigid_matrix @ (scale * x, 1)",
+    "present": "false: the object is not here, or not seen well enough, and the pose is a guess; by confidence",
+    "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter",
+    "covariance": "6 x 6, of rotation vector (rad, about the object's centre) and translation (m), camera axes",
+    "least_certain_turn": "the object's axis about which it may be turned, and by how much (standard deviation)",
     "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
 }
+
+UNSURE_TURN = 25.0  # degrees of standard deviation from which people are told about it
 
 
 class Plain(NamedTuple):
@@ -121,6 +127,7 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
         "mesh_file": info.mesh_file,
         "mesh_sha256": info.mesh_sha256,
         "success": found,
+        "present": found and bool(estimate.present),
         "confidence": float(estimate.confidence) if found else 0.0,
         "camera_from_mesh": None,
         "camera_from_object": None,
@@ -136,6 +143,17 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
     told["size_mm"] = {
         "diameter": 1e3 * float(scale),
         "box": [1e3 * float(scale) * float(side) for side in np.asarray(templates.extents)],
+        "diameter_std": 1e3 * float(estimate.scale_std),
+    }
+    told["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
+    turn = np.asarray(estimate.ambiguity, np.float64)
+    length = float(np.linalg.norm(turn))
+    told["least_certain_turn"] = {
+        "axis_of_object": (turn / max(length, 1e-12)).tolist(),
+        "std_deg": float(np.degrees(length)),
+    }
+    told["agreement"] = {
+        name: float(getattr(estimate.agreement, name)) for name in ("depth", "features", "drawn", "rival")
     }
     if info.metres_per_unit is not None:
         told["size_from_mesh_mm"] = {"diameter": 1e3 * info.metres_per_unit / info.mesh_scale}
@@ -152,7 +170,7 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
             continue
         told["alternatives"].append(
             {
-                "confidence": float(scores[i]),
+                "score": float(scores[i]),
                 "camera_from_mesh": tell_pose(*compose(other, info.object_from_mesh), "mesh_unit"),
             }
         )

@@ -17,7 +17,7 @@ from typing import Any
 import equinox as eqx
 
 from ipjax import __version__
-from ipjax.config import Config, OnboardConfig
+from ipjax.config import PRESETS, Config, OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.host.bop import MM, Dataset, DatasetError, Estimate, Frame, Target, write_atomically
 from ipjax.host.degradation import degrade
@@ -46,16 +46,16 @@ class Known:
 
 
 def read_config(name: str | Path) -> Config:
-    """``default`` (or ``best``), ``paper``, or a JSON file of what differs from the default, for instance
+    """``default``, ``fast``, ``paper``, or a JSON file of what differs from the default, for instance
     ``{"from": "paper", "match": {"views": 4}}``.
 
     Raises ValueError, in a sentence, for a setting that does not exist or is of the wrong kind.
     """
-    if str(name) in ("default", "best", "paper"):
-        return Config.paper() if str(name) == "paper" else Config()
+    if str(name) in PRESETS:
+        return Config.named(str(name))
     path = Path(name)
     if not path.is_file():
-        raise ValueError(f"{name}: neither paper, default nor a file of settings")
+        raise ValueError(f"{name}: neither {', '.join(PRESETS)} nor a file of settings")
     try:
         entry = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
@@ -63,9 +63,9 @@ def read_config(name: str | Path) -> Config:
     if not isinstance(entry, dict):
         raise ValueError(f"{path}: settings are a JSON object, like {{'match': {{'views': 4}}}}")
     start = entry.pop("from", "default")
-    if start not in ("default", "best", "paper"):
-        raise ValueError(f"{path}: 'from' is default or paper, not {start!r}")
-    return _replaced(read_config(start), entry, str(path))
+    if start not in PRESETS:
+        raise ValueError(f"{path}: 'from' is one of {', '.join(PRESETS)}, not {start!r}")
+    return _replaced(Config.named(start), entry, str(path))
 
 
 def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:

@@ -1,0 +1,70 @@
+"""``python -m benchmarks.ablation DATA [--levels 0 2]``: what each step beyond the paper's method is worth.
+
+From the paper's recipe to `Config()`, one step added after the other, on scans and on degraded meshes (``--levels``) or
+on a reconstructed one (``--reconstruction``). Settings of each step are written as JSON beside the results, so a step
+can be run alone: ``ipjax evaluate DATA --config FILE``. Killed and called again it goes on. Ends with one table.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+from benchmarks import evaluation, results_page
+from ipjax.host.bop import write_atomically
+
+BY_DEPTH = {"ranking": "render", "power": 0.0, "alternates": 0, "drawn": 0}  # candidates compared by depth alone
+STEPS = {
+    "1_paper": {"from": "paper"},
+    "2_views_by_cosine": {"from": "paper", "match": {"ranking": "cosine", "centred": True, "cycle": 1.5}},
+    "3_more_pairs_and_gates": {"refine": {"steps": 0}, "score": {"ranking": "inliers"}},
+    "4_chosen_by_depth": {"refine": {"steps": 0}, "score": BY_DEPTH},
+    "5_and_by_features": {"refine": {"steps": 0}, "score": {"alternates": 0, "drawn": 0}},
+    "6_refined_to_the_depth": {"refine": {"silhouette_weight": 0.0}, "score": {"alternates": 0, "drawn": 0}},
+    "7_and_to_the_outline": {"score": {"alternates": 0, "drawn": 0}},
+    "8_tried_turned": {"score": {"drawn": 0}},
+    "9_drawn_again": {},  # Config()
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write the settings, run them all, print the table."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or "-h" in arguments or "--help" in arguments:
+        print(__doc__)
+        print("options are those of benchmarks.evaluation, but for --methods; -o defaults to out/ablation")
+        return
+    if "--methods" in arguments:
+        raise SystemExit("error: --methods is what an ablation is about; see benchmarks.evaluation to choose them")
+    folder = Path("out/ablation")
+    for flag in ("-o", "--output"):
+        if flag in arguments:
+            folder = Path(arguments[arguments.index(flag) + 1])
+    settings = folder / "settings"
+    settings.mkdir(parents=True, exist_ok=True)
+    files = []
+    for name, changes in STEPS.items():
+        files.append(settings / f"{name}.json")
+        write_atomically(files[-1], json.dumps(changes, indent=1) + "\n")
+    page = [] if "--page" in arguments else ["--page", str(folder / "page")]
+    evaluation.main([*arguments, "-o", str(folder), *page, "--methods", *map(str, files)])
+    text = table(results_page.read_studies(folder / "studies.json"))
+    write_atomically(folder / "table.md", text)
+    print(text)
+
+
+def table(studies: list[results_page.Study]) -> str:
+    """A row for each step, a column for each study: AR of all frames and its interval; and the medians of the first."""
+    first = studies[0]
+    head = ["step", *(f"{s.title}: AR" for s in studies), "rotation °", "translation mm", "scale %"]
+    rows = [head]
+    for index, run in enumerate(first.runs):
+        cells = []
+        for study in studies:
+            part = study.runs[index]["all_frames"]
+            cells.append(results_page.percent(part["recalls"].get("ar"), part["intervals"].get("ar")))
+        rows.append([run["method"].removeprefix("ipjax-").replace("_", " "), *cells, *results_page.median_cells(run)])
+    return "\n".join(results_page.markdown_table(rows)) + f"\n\nMedians are those of {first.title}.\n"
+
+
+if __name__ == "__main__":
+    main()

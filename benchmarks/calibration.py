@@ -1,0 +1,174 @@
+"""``python -m benchmarks.calibration RESULTS.jsonl``: is a confidence of 0.8 right in 80 of 100 cases?
+
+Reads what `benchmarks.photo_pairs synthetic` wrote: objects made in code on cluttered tables, known from their mesh,
+from one RGB-D photo and from one photo, sought where they are and behind another object's mask. Half of the objects fit
+the numbers of `ConfidenceConfig`, the other half judge those that the code has now. No object of the real data is among
+them.
+
+    python -m benchmarks.photo_pairs synthetic --data FOLDER --output out/pairs.jsonl
+    python -m benchmarks.calibration out/pairs.jsonl --page benchmarks/results/confidence
+
+prints what fits best; with --page it also writes the held-out figures and the reliability diagram.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from benchmarks.measure import commit
+from ipjax.config import ConfidenceConfig
+from ipjax.host.bop import write_atomically
+
+RIGHT = 0.1  # of the diameter: the mean distance of surface points below which a pose counts as right
+
+
+def read(paths: list[Path]) -> list[dict]:
+    """The lines of objects made in code, in the order in which they were written."""
+    rows = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
+    rows = [row for row in rows if "agreement" in row and " obj_" not in row["key"][1]]
+    if not rows:
+        raise SystemExit("no line is of an object made in code with an agreement: run benchmarks.photo_pairs synthetic")
+    return rows
+
+
+def split(rows: list[dict]) -> tuple[list[dict], list[dict]]:
+    """By object, every other one: those to fit, and those held out."""
+    names = sorted({row["key"][1] for row in rows})
+    fit = set(names[::2])
+    return [row for row in rows if row["key"][1] in fit], [row for row in rows if row["key"][1] not in fit]
+
+
+def cases(rows: list[dict], *, drawn: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the regression sees [n 5], whether the pose is right [n], and whether the object was there at all [n]."""
+    seen = [(row["agreement"], row["add"] < RIGHT, True) for row in rows]
+    seen += [(row["absent"]["agreement"], False, False) for row in rows if "agreement" in row.get("absent", {})]
+    parts = np.array([agreement for agreement, _, _ in seen])
+    logs = np.log(np.clip(parts[:, :3], 1e-3, 1))
+    if not drawn:
+        logs[:, 2] = 0
+    features = np.concatenate([np.ones((len(parts), 1)), logs, parts[:, 3:]], axis=1)
+    return features, np.array([right for _, right, _ in seen]), np.array([there for _, _, there in seen])
+
+
+def fit_logistic(features: np.ndarray, right: np.ndarray, ridge: float = 0.03) -> np.ndarray:
+    """Newton's method on the likelihood, with a little shrinkage of all weights but the first.
+
+    How much was chosen by leaving out one of the objects to fit after another.
+    """
+    weights = np.zeros(features.shape[1])
+    shrink = ridge * np.diag([0.0] + [1.0] * (features.shape[1] - 1))
+    for _ in range(50):
+        chance = 1 / (1 + np.exp(-np.clip(features @ weights, -30, 30)))
+        slope = features.T @ (right - chance) - shrink @ weights
+        curve = (features * (chance * (1 - chance))[:, None]).T @ features + shrink + 1e-9 * np.eye(len(weights))
+        weights = weights + np.linalg.solve(curve, slope)
+    return weights
+
+
+def chances(features: np.ndarray, weights) -> np.ndarray:
+    """As `ipjax.confidence.probability`."""
+    return 1 / (1 + np.exp(-np.clip(features @ np.asarray(weights), -30, 30)))
+
+
+def reliability(chance: np.ndarray, right: np.ndarray, bins: int = 10) -> tuple[float, list[tuple[float, float, int]]]:
+    """The expected calibration error, and for each tenth of the scale: mean confidence, share right, count."""
+    index = np.minimum((chance * bins).astype(int), bins - 1)
+    rows = [(float(chance[index == k].mean()), float(right[index == k].mean()), int((index == k).sum()))
+            for k in range(bins) if (index == k).any()]  # fmt: skip
+    return sum(abs(said - was) * count for said, was, count in rows) / len(chance), rows
+
+
+def surprises(rows: list[dict], config: ConfidenceConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Squared Mahalanobis lengths of right poses, and their errors of scale in standard deviations (free scales)."""
+    good = [row for row in rows if row["add"] < RIGHT]
+    factor = [config.independent / row["independent"] for row in good]
+    squared = np.array([row["surprise"] * f for row, f in zip(good, factor, strict=True)])
+    free = [row["scale_surprise"] * f**0.5 for row, f in zip(good, factor, strict=True) if row["scale_free"]]
+    return squared, np.array(free)
+
+
+def main() -> None:
+    """Fit, judge, print, and write the page where asked to."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.calibration", description=__doc__.split("\n")[0])
+    parser.add_argument("results", type=Path, nargs="+", metavar="RESULTS.jsonl")
+    parser.add_argument("--page", type=Path, help="write the page here, without .md and .png")
+    options = parser.parse_args()
+    rows = read(options.results)
+    fit, held = split(rows)
+    now = ConfidenceConfig()
+    told = lambda weights: "(" + ", ".join(f"{w:.2f}" for w in weights) + ")"
+    print(f"best for the {len({r['key'][1] for r in fit})} objects to fit:")
+    print(f"  drawn = {told(fit_logistic(*cases(fit)[:2]))}")
+    print(f"  undrawn = {told(fit_logistic(*cases(fit, drawn=False)[:2]))}")
+    squared, _ = surprises(fit, now)
+    factor = stats.chi2.median(6) / max(float(np.median(squared)), 1e-9)
+    print(f"  independent = {now.independent * factor:.3g}, pair_share = {now.pair_share * factor:.3g}\n")
+    text, picture = page(held, now)
+    print(text)
+    if options.page:
+        options.page.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(options.page.with_suffix(".md"), text + f"\n![reliability diagram]({options.page.name}.png)\n")
+        draw(picture, options.page.with_suffix(".png"))
+
+
+def page(held: list[dict], config: ConfidenceConfig) -> tuple[str, list[tuple[float, float, int]]]:
+    """The held-out figures in Markdown, and the reliability rows."""
+    features, right, there = cases(held)
+    chance = chances(features, config.drawn)
+    error, rows = reliability(chance, right)
+    squared, scales = surprises(held, config)
+    objects = len({row["key"][1] for row in held})
+    share = lambda chosen: f"{np.mean(chance[chosen] >= config.least):.1%}"
+    inside = np.mean(squared < stats.chi2.ppf(0.9, 6))
+    lines = [
+        "# How far the confidence can be trusted",
+        "",
+        f"Made by `python -m benchmarks.calibration`, commit {commit()}: {objects} objects made in code "
+        f"that fitted nothing, each known from its mesh, from one RGB-D photo and from one photo; {there.sum()} "
+        f"searches where the object was and {(~there).sum()} behind another object's mask. A pose is right if surface "
+        f"points are off by less than a tenth of the diameter on average (ADD).",
+        "",
+        "| what | figure |",
+        "|---|---|",
+        f"| right among poses of objects that were there | {right[there].mean():.0%} |",
+        f"| expected calibration error, ten bins | {error:.3f} |",
+        f"| absent objects reported as present (confidence ≥ {config.least:g}) | {share(~there)} |",
+        f"| right poses reported as present | {share(right)} |",
+        f"| wrong poses of present objects reported as present | {share(there & ~right)} |",
+        f"| right poses inside the covariance's 90 % ellipsoid | {inside:.0%} of {len(squared)} |",
+    ]
+    if len(scales):
+        lines.append(
+            f"| sizes of right poses within 1.64 standard deviations (90 %) | {np.mean(np.abs(scales) < 1.645):.0%} "
+            f"of {len(scales)} |"
+        )
+    lines += ["", "| confidence said | were right | cases |", "|---|---|---|"]
+    lines += [f"| {said:.2f} | {was:.2f} | {count} |" for said, was, count in rows]
+    return "\n".join(lines) + "\n", rows
+
+
+def draw(rows: list[tuple[float, float, int]], path: Path) -> None:
+    """The reliability diagram: a well-calibrated confidence lies on the diagonal."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(4.6, 4.2))
+    axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+    said, was, count = np.array(rows).T
+    axes.scatter(said, was, s=20 + 200 * count / count.max(), color="#2563eb", zorder=3)
+    for x, y, n in rows:
+        axes.annotate(str(n), (x, y), xytext=(7, -10), textcoords="offset points", fontsize=8, color="0.4")
+    axes.set(xlabel="confidence said", ylabel="share right", xlim=(-0.02, 1.05), ylim=(-0.05, 1.05))
+    axes.set_title("held-out synthetic scenes; numbers are cases", fontsize=9)
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
