@@ -50,19 +50,33 @@ def hide(cloud: Cloud, hidden) -> Cloud:
     return gather(cloud.points, cloud.valid & ~hidden, cloud.camera, mask, depth)
 
 
-@given(seed=st.integers(0, 2**31))
-def test_a_disturbed_pose_comes_back(scene, seed):
-    """From 6° and 4 % of the diameter; a smooth ellipsoid leaves its rotation the least determined."""
+def surface_gap(pose, truth, surface) -> float:
+    """Root mean square distance of the placed surface from the true ellipsoid, in diameters.
+
+    To the ellipsoid, not between points of the same name: a smooth one may slide along itself, which no depth forbids.
+    """
+    placed = np.asarray(pose @ surface.points, np.float64)
+    inside = (placed - np.asarray(truth.translation)) @ np.asarray(truth.rotation) / float(truth.scale)
+    radius = np.linalg.norm(inside / problems.AXES, axis=1)
+    slope = np.linalg.norm(inside / problems.AXES**2, axis=1) / radius
+    return float(np.sqrt(np.mean(((radius - 1) / slope) ** 2)))
+
+
+def test_disturbed_poses_come_back(scene):
+    """From 6° and 4 % of the diameter: all onto the surface, half of them to less than half of where they began."""
     surface, cloud, truth = scene
-    rng = np.random.default_rng(seed)
-    direction = rng.normal(size=7)
-    step = np.concatenate([0.1 * direction[:3] / np.linalg.norm(direction[:3]), 0.02 * direction[3:6], [0.0]])
-    start = retract(truth, jnp.asarray(step, jnp.float32))
-    found, cost = run(surface, cloud, start, CONFIG)
-    _, before = run(surface, cloud, start, RefineConfig(steps=0, points=256))
-    distance = lambda pose: float(jnp.max(jnp.linalg.norm(pose @ surface.points - truth @ surface.points, axis=-1)))
-    assert float(cost) <= float(before) + 1e-6
-    assert distance(found) < max(0.05 * float(truth.scale), 0.8 * distance(start))
+    began, ended = [], []
+    for seed in range(40):
+        direction = np.random.default_rng(seed).normal(size=7)
+        step = np.concatenate([0.1 * direction[:3] / np.linalg.norm(direction[:3]), 0.02 * direction[3:6], [0.0]])
+        start = retract(truth, jnp.asarray(step, jnp.float32))
+        found, cost = run(surface, cloud, start, CONFIG)
+        _, before = run(surface, cloud, start, RefineConfig(steps=0, points=256))
+        assert float(cost) <= float(before) + 1e-6
+        began.append(surface_gap(start, truth, surface))
+        ended.append(surface_gap(found, truth, surface))
+    assert max(ended) < 0.03
+    assert np.median(ended) < 0.5 * np.median(began)
 
 
 @given(seed=st.integers(0, 2**31))
