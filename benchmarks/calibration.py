@@ -76,8 +76,8 @@ def chances(features: np.ndarray, weights) -> np.ndarray:
 def reliability(chance: np.ndarray, right: np.ndarray, bins: int = 10) -> tuple[float, list[tuple[float, float, int]]]:
     """The expected calibration error, and for each tenth of the scale: mean confidence, share right, count."""
     index = np.minimum((chance * bins).astype(int), bins - 1)
-    rows = [(float(chance[index == k].mean()), float(right[index == k].mean()), int((index == k).sum()))
-            for k in range(bins) if (index == k).any()]  # fmt: skip
+    filled = [index == k for k in range(bins) if (index == k).any()]
+    rows = [(float(chance[inside].mean()), float(right[inside].mean()), int(inside.sum())) for inside in filled]
     return sum(abs(said - was) * count for said, was, count in rows) / len(chance), rows
 
 

@@ -451,7 +451,7 @@ def _summary(frame: str, one: dict[str, Any]) -> str:
         return f"{frame}: {one['object']}: no pose found"
     from ipjax.host.reports import UNSURE_TURN
 
-    turn = one["least_certain_turn"]["std_deg"]
+    turn = one["ambiguity"]["std_deg"]
     ending = f"; may be turned (± {turn:.0f}° about one axis)" if turn > UNSURE_TURN else ""
     if not one["present"]:
         ending += "; NOT HERE, or not seen well enough: the pose is a guess"

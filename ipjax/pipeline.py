@@ -55,18 +55,19 @@ def estimate(
     query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
-        poses, score, _, determined = align(pairs, size, key, config.align, diameter=diameter)
+        poses, agreed, _, determined = align(pairs, size, key, config.align, diameter=diameter)
     scale_known = diameter is not None
     scene = _Scene(query, config.score.resolution, config.refine.silhouette)
     parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
-    nothing = Agreement(*[jnp.zeros_like(score)] * 4)
-    found = _Candidates(poses, parent, determined, jnp.where(determined, score, -1), nothing)
+    unknown = Agreement(*[jnp.zeros_like(agreed)] * 4)
+    found = _Candidates(poses, parent, determined, jnp.where(determined, agreed, -1), unknown)
     drawing = encoder is not None and templates.appearance is not None and config.score.drawn > 0
     if config.score.ranking == "render":
         found = _rounds(templates, query, scene, found, config, scale_known=scale_known)
         if drawing:
             found = _draw_best(encoder, templates, query, scene, found, config)
-    found = jax.tree.map(lambda x: x[lax.top_k(found.score, found.score.shape[0])[1]], found)
+    order = lax.top_k(found.score, found.score.shape[0])[1]
+    found = jax.tree.map(lambda x: x[order], found)
     best = jax.tree.map(lambda x: x[0], found)
     offset = best.poses @ pairs.object[best.parent] - pairs.camera[best.parent]
     squared = jnp.sum(offset**2, axis=-1)
@@ -77,7 +78,7 @@ def estimate(
         agreement = eqx.tree_at(lambda a: a.rival, best.agreement, find_rival(found.poses, found.score))
         if config.score.ranking == "render":
             weights = config.confidence.drawn if drawing else config.confidence.undrawn
-            weights = jnp.stack([jnp.asarray(x, score.dtype) for x in weights])
+            weights = jnp.stack([jnp.asarray(x, agreed.dtype) for x in weights])
             confidence = jnp.where(best.determined, probability(agreement, weights), 0)
             present = best.determined & (confidence >= config.confidence.least)
         else:  # the share of pairs that agree is no probability

@@ -119,7 +119,7 @@ class Hypotheses(eqx.Module):
 
 
 class Agreement(eqx.Module):
-    """How well a pose explains the query, part by part; each in [0, 1]."""
+    """How well a pose explains the query, part by part; each in [0, 1], 0 where candidates are not scored."""
 
     depth: Float[Array, "*b"]  # share of what is seen whose depth agrees
     features: Float[Array, "*b"]  # cosine of the nearest templates' patches, carried into the query

@@ -11,8 +11,10 @@ import pytest
 
 from benchmarks import ablation, calibration, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
+from ipjax.confidence import probability
 from ipjax.config import ConfidenceConfig, Config
 from ipjax.host.studies import describe_config, read_config
+from ipjax.types import Agreement
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = {
@@ -103,6 +105,15 @@ def test_a_calibration_finds_the_odds_that_made_the_data():
     error, rows = calibration.reliability(calibration.chances(features, found), right)
     assert error < 0.03 and sum(count for _, _, count in rows) == 4000
     assert calibration.reliability(np.full(100, 0.9), np.arange(100) < 50)[0] == pytest.approx(0.4)
+
+
+def test_chances_are_the_probabilities_of_the_estimate():
+    row = make_row(0, True)
+    features, _, _ = calibration.cases([row])
+    weights = ConfidenceConfig().drawn
+    agreement = Agreement(*(jnp.asarray(x, jnp.float32) for x in row["agreement"]))
+    expected = float(probability(agreement, jnp.asarray(weights)))
+    assert calibration.chances(features, weights)[0] == pytest.approx(expected, rel=1e-4)
 
 
 def make_row(turn: int, right: bool, *, surprise: float = 6.0) -> dict:

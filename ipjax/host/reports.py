@@ -25,9 +25,10 @@ CONVENTIONS = {
     "matrix": "4 x 4, row by row, [scale * rotation, translation; 0 0 0 1]: x_camera = matrix @ (x, 1)",
     "rigid_matrix": "4 x 4, row by row, [rotation, translation; 0 0 0 1]: x_camera = rigid_matrix @ (scale * x, 1)",
     "present": "false: the object is not here, or not seen well enough, and the pose is a guess; by confidence",
-    "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter",
+    "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter; "
+    "of method paper: the share of pairs that agree",
     "covariance": "6 x 6, of rotation vector (rad, about the object's centre) and translation (m), camera axes",
-    "least_certain_turn": "the object's axis about which it may be turned, and by how much (standard deviation)",
+    "ambiguity": "the object's axis about which it may be turned, and by how much (standard deviation)",
     "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
 }
 
@@ -148,7 +149,7 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
     told["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
     turn = np.asarray(estimate.ambiguity, np.float64)
     length = float(np.linalg.norm(turn))
-    told["least_certain_turn"] = {
+    told["ambiguity"] = {
         "axis_of_object": (turn / max(length, 1e-12)).tolist(),
         "std_deg": float(np.degrees(length)),
     }
