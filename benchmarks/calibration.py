@@ -104,7 +104,8 @@ def main() -> None:
     print(f"  drawn = {told(fit_logistic(*cases(fit)[:2]))}")
     print(f"  undrawn = {told(fit_logistic(*cases(fit, drawn=False)[:2]))}")
     squared, _ = surprises(fit, now)
-    factor = stats.chi2.median(6) / max(float(np.median(squared)), 1e-9)
+    # By the 90 % ellipsoid: errors have longer tails than a Gaussian, and the tails are what a covariance is asked for.
+    factor = stats.chi2.ppf(0.9, 6) / max(float(np.quantile(squared, 0.9)), 1e-9)
     print(f"  independent = {now.independent * factor:.3g}, pair_share = {now.pair_share * factor:.3g}\n")
     text, picture = page(held, now)
     print(text)

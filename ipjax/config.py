@@ -38,7 +38,7 @@ class AlignConfig(eqx.Module):
     count: int = _static(1024)  # minimal sets per view
     size: int = _static(3)  # pairs in one
     rank: Literal["msac", "count"] = _static("msac")
-    keep: int = _static(2)  # hypotheses kept per view
+    keep: int = _static(1)  # hypotheses kept per view
     refits: int = _static(3)
     threshold: float = 0.08  # residual of an inlier, in diameters: about one patch
     scale_gate: tuple[float, float] = (0.5, 2.0)  # around the size seen in the mask and depth
@@ -67,7 +67,9 @@ class ScoreConfig(eqx.Module):
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
     power: float = 2.0  # of the feature agreement beside the depth agreement
     tolerance: float = 0.05  # depth difference that still agrees, in diameters
-    drawn: int = _static(8)  # best candidates drawn and compared again, where the encoder is given; 0 = none
+    drawn: int = _static(6)  # best candidates drawn and compared again, where the encoder is given; 0 = none
+    depth_power: float = 0.5  # of the depth agreement of a drawn candidate; 1 for that of its features
+    colour_weight: float = 0.5  # logarithm of what the correlation of colours can add to a drawn candidate
     apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters are drawn once
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
@@ -75,11 +77,11 @@ class ScoreConfig(eqx.Module):
 class ConfidenceConfig(eqx.Module):
     """From agreement to a probability and a covariance; most of it fitted by ``python -m benchmarks.calibration``."""
 
-    drawn: tuple[float, float, float, float, float] = (7.87, 0.59, 2.02, 5.42, -6.02)  # see ``confidence.probability``
-    undrawn: tuple[float, float, float, float, float] = (8.63, 1.02, 6.20, 0.0, -6.83)  # where no candidate was drawn
+    drawn: tuple[float, float, float, float, float] = (8.31, 0.95, 1.45, 6.74, -5.38)  # see ``confidence.probability``
+    undrawn: tuple[float, float, float, float, float] = (9.59, 1.53, 6.61, 0.0, -6.84)  # where no candidate was drawn
     least: float = 0.5  # confidence below which the object is not here, or not seen well enough
-    independent: float = 46.0  # independent residuals of refinement
-    pair_share: float = 0.11  # of the pairs that are independent
+    independent: float = 10.3  # independent residuals of refinement
+    pair_share: float = 0.025  # of the pairs that are independent
     tie: float = 0.05  # how fast an alternative's weight falls with the share by which its score is lower; not fitted
 
 
@@ -97,7 +99,6 @@ class Config(eqx.Module):
         """Fewer hypotheses, none of them tried turned, and three drawn: less sure which way round things are."""
         return Config(
             match=MatchConfig(views=6),
-            align=AlignConfig(keep=1),
             refine=RefineConfig(steps=8),
             score=ScoreConfig(alternates=0, drawn=3),
         )

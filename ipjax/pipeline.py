@@ -16,7 +16,7 @@ from ipjax.features import lift, object_features
 from ipjax.matching import match, select
 from ipjax.refinement import Cloud, information, refine, trace_contour
 from ipjax.scoring import score
-from ipjax.types import Agreement, Camera, Hypotheses, Patches, PoseEstimate, Query, Similarity, Templates
+from ipjax.types import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
 
 
 def estimate(
@@ -69,37 +69,16 @@ def estimate(
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
     best = jax.tree.map(lambda x: x[0], found)
-    offset = best.poses @ pairs.object[best.parent] - pairs.camera[best.parent]
-    squared = jnp.sum(offset**2, axis=-1)
+    matched = jax.tree.map(lambda x: x[best.parent], pairs)
+    squared = jnp.sum((best.poses @ matched.object - matched.camera) ** 2, axis=-1)
     near = squared < (config.align.threshold * best.poses.scale) ** 2
-    used = (pairs.weight[best.parent] > 0) & near & best.determined
+    used = (matched.weight > 0) & near & best.determined
     count = jnp.sum(used)
     with jax.named_scope("confidence"):
-        agreement = eqx.tree_at(lambda a: a.rival, best.agreement, find_rival(found.poses, found.score))
-        if config.score.ranking == "render":
-            weights = config.confidence.drawn if drawing else config.confidence.undrawn
-            weights = jnp.stack([jnp.asarray(x, agreed.dtype) for x in weights])
-            confidence = jnp.where(best.determined, probability(agreement, weights), 0)
-            present = best.determined & (confidence >= config.confidence.least)
-        else:  # the share of pairs that agree is no probability
-            confidence, present = jnp.clip(best.score, 0, 1), best.determined
-        matched = jax.tree.map(lambda x: x[best.parent], pairs)
-        spread, scale_std = covariance(
-            information(templates.surface, scene.cloud, best.poses, config.refine),
-            pair_information(best.poses, matched, used),
-            best.poses.scale,
-            config.confidence,
-            scale_known=scale_known,
-        )
-        ambiguity = loosest_turn(found.poses, found.score, spread[:3, :3], config.confidence)
+        sure = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
     return PoseEstimate(
         camera_from_object=best.poses,
-        confidence=confidence,
-        present=present,
-        covariance=spread,
-        scale_std=scale_std,
-        ambiguity=ambiguity,
-        agreement=agreement,
+        **sure,
         hypotheses=Hypotheses(found.poses, jnp.clip(found.score, 0, 1)),
         view=matches.view[best.parent],
         view_score=matches.ranking,
@@ -117,6 +96,48 @@ class _Candidates(eqx.Module):
     determined: Bool[Array, "*n"]
     score: Float[Array, "*n"]  # -1 = absent
     agreement: Agreement
+
+
+def _certainty(
+    templates: Templates,
+    scene: "_Scene",
+    found: _Candidates,
+    pairs: Pairs,
+    used: Bool[Array, "k"],
+    config: Config,
+    *,
+    drawing: bool,
+    scale_known: bool,
+) -> dict[str, Array | Agreement]:
+    """What an estimate says of itself; the candidates are sorted, the pairs are the best one's."""
+    best = jax.tree.map(lambda x: x[0], found)
+    parts = found.agreement
+    # Not the score: the numbers that turn this into a probability outlive a change of its formula.
+    evidence = parts.depth * parts.features * parts.drawn if drawing else found.score
+    rival = find_rival(found.poses, jnp.where(found.score > 0, evidence, 0))
+    agreement = eqx.tree_at(lambda a: a.rival, best.agreement, rival)
+    if config.score.ranking == "render":
+        weights = config.confidence.drawn if drawing else config.confidence.undrawn
+        weights = jnp.stack([jnp.asarray(x, found.score.dtype) for x in weights])
+        confidence = jnp.where(best.determined, probability(agreement, weights), 0)
+        present = best.determined & (confidence >= config.confidence.least)
+    else:  # the share of pairs that agree is no probability
+        confidence, present = jnp.clip(best.score, 0, 1), best.determined
+    spread, scale_std = covariance(
+        information(templates.surface, scene.cloud, best.poses, config.refine),
+        pair_information(best.poses, pairs, used),
+        best.poses.scale,
+        config.confidence,
+        scale_known=scale_known,
+    )
+    return {
+        "confidence": confidence,
+        "present": present,
+        "covariance": spread,
+        "scale_std": scale_std,
+        "ambiguity": loosest_turn(found.poses, found.score, spread[:3, :3], config.confidence),
+        "agreement": agreement,
+    }
 
 
 def _check_shapes(templates: Templates, query: Query) -> None:
@@ -166,40 +187,41 @@ def _rounds(
 ) -> _Candidates:
     """Refine and score the hypotheses; then do the same with the best of them turned about the box's axes.
 
-    Both rounds are one body of a scan, so that refinement is compiled once; the shorter one is padded with copies.
+    Both rounds are one body of a scan, so that refinement is compiled once; they take the same number of poses.
     """
-    turned = config.score.alternates
-    count = max(first.score.shape[0], TURNS * turned)
-    pad = lambda x: jnp.concatenate([x, jnp.repeat(x[:1], count - x.shape[0], axis=0)])
-    absent = lambda flags: jnp.pad(flags, (0, count - flags.shape[0]))  # copies are no hypotheses of their own
+    turned, count = config.score.alternates, first.score.shape[0]
 
     def one_round(given, _):
         poses, parent, determined = given
-        poses, score, agreement = _improve_and_score(templates, query, scene, poses, config, scale_known=scale_known)
-        found = _Candidates(poses, parent, determined, jnp.where(determined, score, -1), agreement)
+        if config.refine.steps:
+            with jax.named_scope("refine"):
+                fit = lambda pose: refine(templates.surface, scene.cloud, pose, config.refine, scale_known=scale_known)
+                poses = jax.vmap(lambda pose: fit(pose)[0])(poses)
+        rated, agreement = _rate(templates, query, scene, poses, config)
+        found = _Candidates(poses, parent, determined, jnp.where(determined, rated, -1), agreement)
         if not turned:
             return given, found
         best = lax.top_k(found.score, turned)[1]
         again = lambda x: jnp.repeat(x[best], TURNS, axis=0)
-        alternates = jax.tree.map(pad, turn(jax.tree.map(lambda x: x[best], poses), templates.axes))
-        return (alternates, pad(again(parent)), absent(again(determined))), found
+        alternates = turn(jax.tree.map(lambda x: x[best], poses), templates.axes)
+        # Most turns explain little, which shows before they are refined.
+        promise = jnp.where(again(determined), _rate(templates, query, scene, alternates, config)[0], -1)
+        chosen = lax.top_k(promise, min(count, TURNS * turned))[1]
+        there = jnp.arange(count) < chosen.shape[0]  # what fills the round up is no hypothesis of its own
+        pick = lambda x: jnp.resize(x[chosen], (count, *x.shape[1:]))
+        return (jax.tree.map(pick, alternates), pick(again(parent)), pick(again(determined)) & there), found
 
-    start = (jax.tree.map(pad, first.poses), pad(first.parent), absent(first.determined))
+    start = first.poses, first.parent, first.determined
     _, found = lax.scan(one_round, start, None, length=2 if turned else 1)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
 
-def _improve_and_score(
-    templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config, *, scale_known: bool
-) -> tuple[Similarity, Float[Array, "h"], Agreement]:
-    if config.refine.steps:
-        with jax.named_scope("refine"):
-            fit = lambda pose: refine(templates.surface, scene.cloud, pose, config.refine, scale_known=scale_known)[0]
-            poses = jax.vmap(fit)(poses)
+def _rate(
+    templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config
+) -> tuple[Float[Array, "h"], Agreement]:
     with jax.named_scope("score"):
-        camera = scene.cloud.camera
-        rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score)
-        return poses, *jax.vmap(rate)(poses)
+        rate = lambda pose: score(templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
+        return jax.vmap(rate)(poses)
 
 
 def _draw_best(

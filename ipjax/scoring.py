@@ -32,6 +32,9 @@ def score(
 ) -> tuple[Float[Array, ""], Agreement]:
     """The score in [0, 1] of one hypothesis, and its parts; the caller vmaps.
 
+    Where the hypothesis is drawn, depth counts less than features, for a wrong mesh often fits its depth better turned
+    wrong, and colours count, too.
+
     Args:
       query: its patches centred on the templates' mean, as the templates' are.
       depth, mask, camera: the query's crop on a coarse grid (metres, 0 = unknown; one pixel per cell).
@@ -43,8 +46,8 @@ def score(
         drawn = jnp.ones_like(geometry)
         total = geometry * features**config.power
     else:
-        drawn = drawn_agreement(encoder, templates, query, camera_from_object, config)
-        total = geometry * features * drawn
+        drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
+        total = geometry**config.depth_power * features * drawn * jnp.exp(config.colour_weight * (colour - 1))
     return total, Agreement(geometry, features, drawn, jnp.zeros_like(geometry))
 
 
@@ -123,15 +126,19 @@ def drawn_agreement(
     query: Query,
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
-) -> Float[Array, ""]:
-    """Cosine in [0, 1] between the query's patches and those of the object drawn where the hypothesis puts it.
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """How like the query's patches those of the object are, drawn where the hypothesis puts it: features and colours.
 
-    Summed over patches by the cover that both have, over the cover that either has: what sticks out of the mask, and
-    what of the mask is left empty, counts as zero. What an occluder hides is not drawn.
+    What an occluder hides is not drawn.
 
     Args:
       templates: of the object, with its appearance.
       query: its patches centred on the templates' mean, as the templates' are.
+
+    Returns:
+      The cosine of the features in [0, 1], summed over patches by the cover that both have, over the cover that either
+      has: what sticks out of the mask, and what of the mask is left empty, counts as zero. And the
+      :func:`chroma_correlation` of the patches' mean colours.
 
     Raises:
       ValueError: the templates have no appearance.
@@ -153,7 +160,46 @@ def drawn_agreement(
     drawn, seen = _patch_cover(shown, rows, columns), _patch_cover(view.mask, rows, columns)
     cosine = jnp.sum(features.reshape(query.patches.features.shape) * query.patches.features, axis=-1)
     either = jnp.sum(jnp.maximum(drawn, seen))
-    return jnp.clip(jnp.sum(cosine * jnp.minimum(drawn, seen)) / jnp.maximum(either, 1e-9), 0, 1)
+    shared = jnp.minimum(drawn, seen)
+    agreement = jnp.clip(jnp.sum(cosine * shared) / jnp.maximum(either, 1e-9), 0, 1)
+    colours = [_patch_colour(*one, rows, columns) for one in ((image, shown), (view.rgb, view.mask))]
+    return agreement, chroma_correlation(*colours, shared)
+
+
+def chroma_correlation(
+    first: Float[Array, "p 3"], second: Float[Array, "p 3"], weight: Float[Array, "p"]
+) -> Float[Array, ""]:
+    """How alike colours are spread over two images, whatever their brightness and tint: in [-1, 1], 0 if one is grey.
+
+    The encoder's features hardly tell colours, and a reconstruction that has lost its sharp texture still has them.
+
+    Args:
+      first, second: mean colours of the patches, in [0, 1].
+      weight: of each patch.
+    """
+
+    def deviation(colours):
+        chroma = colours - jnp.mean(colours, axis=-1, keepdims=True)
+        return chroma - mean(chroma)
+
+    mean = lambda x: jnp.sum(x * weight[:, None], axis=0) / jnp.maximum(jnp.sum(weight), 1e-6)
+    a, b = deviation(first), deviation(second)
+    variance = jnp.sqrt(jnp.sum(mean(a * a)) * jnp.sum(mean(b * b)) + 1e-12)
+    return jnp.sum(mean(a * b)) / (variance + _GREY)
+
+
+_GREY = 5e-4  # variance of chroma below which it is the camera's noise
+
+
+def _patch_colour(
+    image: Float[Array, "h w 3"], mask: Bool[Array, "h w"], rows: int, columns: int
+) -> Float[Array, "p 3"]:
+    """Mean colour of what is set of each patch."""
+    height, width = mask.shape
+    shape = rows, height // rows, columns, width // columns, -1
+    total = lambda x: jnp.sum(x.reshape(shape), axis=(1, 3)).reshape(rows * columns, -1)
+    set_here = mask[..., None].astype(image.dtype)
+    return total(image * set_here) / jnp.maximum(total(set_here), 1)
 
 
 def _carried_cosine(

@@ -11,9 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ipjax.cameras import project
 from ipjax.config import ScoreConfig
 from ipjax.refinement import retract
-from ipjax.scoring import closeness, depth_agreement, drawn_agreement, feature_agreement, look_along
+from ipjax.scoring import (
+    chroma_correlation,
+    closeness,
+    depth_agreement,
+    drawn_agreement,
+    feature_agreement,
+    look_along,
+)
 from ipjax.types import Camera
 
 CONFIG = ScoreConfig()
@@ -106,7 +114,7 @@ def drawn(case):
     known = dataclasses.replace(problems.make_templates(), appearance=problems.make_appearance(20_000))
 
     def rate(pose, query=query):
-        return float(drawn_score(encoder, known, query, pose, CONFIG))
+        return float(drawn_score(encoder, known, query, pose, CONFIG)[0])
 
     return rate
 
@@ -148,3 +156,41 @@ def test_nothing_to_draw_is_said(templates, case):
     query, *_, truth = case
     with pytest.raises(ValueError, match="no appearance to draw"):
         drawn_agreement(problems.make_encoder(), templates, query, truth)
+
+
+def test_colours_correlate_whatever_the_light():
+    """A brighter, tinted copy is the same, opposite colours are the opposite, grey says nothing, nor does no patch."""
+    rng = np.random.default_rng(0)
+    colours = jnp.asarray(rng.uniform(0, 1, (40, 3)), jnp.float32)
+    weight = jnp.asarray(rng.uniform(0, 1, 40), jnp.float32)
+    grey = jnp.repeat(colours[:, :1], 3, axis=1) + jnp.asarray(rng.normal(0, 0.003, (40, 3)), jnp.float32)
+    compare = lambda other, share=weight: float(chroma_correlation(colours, other, share))
+    assert compare(colours) > 0.98 and compare(0.4 * colours + jnp.array([0.2, 0.1, 0.0])) > 0.9
+    assert compare(1 - colours) < -0.98
+    assert abs(compare(grey)) < 0.2
+    assert compare(colours, jnp.zeros(40)) == 0
+    half = weight.at[:20].set(0)  # what does not count may be anything
+    assert compare(colours.at[:20].set(0.5), half) == pytest.approx(compare(colours, half), abs=1e-6)
+
+
+def test_colours_tell_what_features_cannot(case):
+    """An encoder that sees nothing leaves the choice to colours: red left and blue right against the reverse."""
+    query, *_, truth = case
+    side = query.view.depth.shape[0]
+    middle = float(np.median(np.nonzero(np.asarray(query.view.mask))[1]))
+    left = (np.arange(side) < middle)[None, :, None]
+    seen = jnp.where(
+        query.view.mask[..., None], jnp.where(left, jnp.array([0.8, 0.2, 0.1]), jnp.array([0.1, 0.2, 0.8])), 0
+    )
+    painted = dataclasses.replace(query, view=dataclasses.replace(query.view, rgb=seen))
+    appearance = problems.make_appearance(20_000)
+    red = (project(query.view.camera, truth @ appearance.points)[:, :1]) < middle
+    paint = lambda first, second: dataclasses.replace(
+        problems.make_templates(),
+        appearance=dataclasses.replace(appearance, colours=jnp.where(red, jnp.array(first), jnp.array(second))),
+    )
+    blind = lambda image: problems.make_encoder()(jnp.zeros_like(image))
+    right = drawn_agreement(blind, paint([0.8, 0.2, 0.1], [0.1, 0.2, 0.8]), painted, truth, CONFIG)
+    wrong = drawn_agreement(blind, paint([0.1, 0.2, 0.8], [0.8, 0.2, 0.1]), painted, truth, CONFIG)
+    assert float(right[1]) > 0.7 and float(wrong[1]) < -0.7
+    assert float(right[0]) == pytest.approx(float(wrong[0]), abs=1e-5)
