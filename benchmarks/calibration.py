@@ -19,6 +19,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.measure import commit
+from benchmarks.photo_pairs import states
 from ipjax.config import ConfidenceConfig
 from ipjax.host.bop import write_atomically
 
@@ -127,7 +128,8 @@ def page(held: list[dict], config: ConfidenceConfig) -> tuple[str, list[tuple[fl
     lines = [
         "# How far the confidence can be trusted",
         "",
-        f"Made by `python -m benchmarks.calibration`, commit {commit()}: {objects} objects made in code "
+        f"Made by `python -m benchmarks.calibration`, commit {commit()}, from searches by commit {states(held)}: "
+        f"{objects} objects made in code "
         f"that fitted nothing, each known from its mesh, from one RGB-D photo and from one photo; {there.sum()} "
         f"searches where the object was and {(~there).sum()} behind another object's mask. A pose is right if surface "
         f"points are off by less than a tenth of the diameter on average (ADD).",

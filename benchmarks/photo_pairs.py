@@ -186,6 +186,7 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
     """Try every pair by every method; lines already in ``output`` are not tried again."""
     import jax.numpy as jnp
 
+    from benchmarks.measure import commit
     from ipjax.cli import _use_cache
     from ipjax.host.estimation import Estimator
     from ipjax.host.foreground import Photo
@@ -201,7 +202,7 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
     encoder = load_encoder(weights)
     everything = Estimator([], encoder)
     scans: dict[str, tuple] = {}
-    tried = 0
+    state, tried = commit(), 0
     with output.open("a") as file:
         for group in groups:
             for method in METHODS:
@@ -250,7 +251,7 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
                     if key in done:
                         continue
                     start = time.perf_counter()
-                    row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble}
+                    row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble, "commit": state}
                     if estimator is not None:
                         row |= judge(group, method, estimator, query)
                     row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
@@ -372,9 +373,14 @@ def table(rows: list[dict]) -> str:
     return "\n".join(lines)
 
 
-def write_page(path: Path, text: str) -> None:
+def states(rows: list[dict]) -> str:
+    """The commits that made the lines, in their order."""
+    return ", ".join(dict.fromkeys(row.get("commit", "unknown") for row in rows))
+
+
+def write_page(path: Path, text: str, measured: str) -> None:
     """The tables with what they rest on."""
-    from benchmarks.measure import commit, describe_device
+    from benchmarks.measure import describe_device
     from ipjax.host.bop import write_atomically
 
     device = describe_device()
@@ -383,12 +389,12 @@ def write_page(path: Path, text: str) -> None:
         "",
         "Made by `python -m benchmarks.photo_pairs`; do not edit by hand. Each object is made from one masked photo "
         "(`rgb`: its outline inflated, size unknown; `rgbd`: its depth completed, size known) or from the true mesh "
-        "(`scan`, the upper bound), and found in another RGB-D frame with a given mask. Angles are between the two "
-        "views of the object. The photo's true pose gives the canonical frame. Pairs where nothing was found count as "
+        "(`scan`, the upper bound, on at most three queries of a reference), and found in another RGB-D frame with a "
+        "given mask. Angles are between the two views of the object. The photo's true pose gives the canonical frame. Pairs where nothing was found count as "
         "misses; medians are of those found; MSSD and MSPD recalls are means over BOP's ten thresholds.",
         "",
         f"{device['device']}, {device['cores']} cores, jax {device['jax']}, Python {device['python']}, "
-        f"commit {commit()}.",
+        f"commit {measured}.",
     ]
     write_atomically(path, "\n".join(head) + "\n\n" + text + "\n")
 
@@ -409,11 +415,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.what == "table":
-        read = lambda path: [json.loads(line) for line in path.read_text().splitlines()]
-        text = "\n\n".join(f"## {path.stem}\n\n{table(read(path))}" for path in options.results)
+        rows = {path: [json.loads(line) for line in path.read_text().splitlines()] for path in options.results}
+        text = "\n\n".join(f"## {path.stem}\n\n{table(rows[path])}" for path in options.results)
         print(text)
         if options.page:
-            write_page(options.page, text)
+            write_page(options.page, text, states(list(itertools.chain(*rows.values()))))
         return
     from ipjax.config import OnboardConfig
 
