@@ -390,8 +390,9 @@ def write_page(path: Path, text: str, measured: str) -> None:
         "Made by `python -m benchmarks.photo_pairs`; do not edit by hand. Each object is made from one masked photo "
         "(`rgb`: its outline inflated, size unknown; `rgbd`: its depth completed, size known) or from the true mesh "
         "(`scan`, the upper bound, on at most three queries of a reference), and found in another RGB-D frame with a "
-        "given mask. Angles are between the two views of the object. The photo's true pose gives the canonical frame. Pairs where nothing was found count as "
-        "misses; medians are of those found; MSSD and MSPD recalls are means over BOP's ten thresholds.",
+        "given mask. Angles are between the two views of the object. The photo's true pose gives the canonical frame. "
+        "Pairs where nothing was found count as misses; medians are of those found; "
+        "MSSD and MSPD recalls are means over BOP's ten thresholds.",
         "",
         f"{device['device']}, {device['cores']} cores, jax {device['jax']}, Python {device['python']}, "
         f"commit {measured}.",
