@@ -1,6 +1,7 @@
 """Figure 2 of the paper, from the query on: one pure function, one graph."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -108,7 +109,7 @@ def _certainty(
     *,
     drawing: bool,
     scale_known: bool,
-) -> dict[str, Array | Agreement]:
+) -> dict[str, Any]:
     """What an estimate says of itself; the candidates are sorted, the pairs are the best one's."""
     best = jax.tree.map(lambda x: x[0], found)
     parts = found.agreement

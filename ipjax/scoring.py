@@ -162,8 +162,9 @@ def drawn_agreement(
     either = jnp.sum(jnp.maximum(drawn, seen))
     shared = jnp.minimum(drawn, seen)
     agreement = jnp.clip(jnp.sum(cosine * shared) / jnp.maximum(either, 1e-9), 0, 1)
-    colours = [_patch_colour(*one, rows, columns) for one in ((image, shown), (view.rgb, view.mask))]
-    return agreement, chroma_correlation(*colours, shared)
+    drawn_colours = _patch_colour(image, shown, rows, columns)
+    seen_colours = _patch_colour(view.rgb, view.mask, rows, columns)
+    return agreement, chroma_correlation(drawn_colours, seen_colours, shared)
 
 
 def chroma_correlation(
