@@ -190,7 +190,8 @@ def _rounds(
 
     Both rounds are one body of a scan, so that refinement is compiled once; they take the same number of poses.
     """
-    turned, count = config.score.alternates, first.score.shape[0]
+    count = first.score.shape[0]
+    turned = min(config.score.alternates, count)
 
     def one_round(given, _):
         poses, parent, determined = given

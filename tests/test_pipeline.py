@@ -225,6 +225,14 @@ def test_with_the_encoder_candidates_are_drawn(templates):
     assert plain.hypotheses.score.shape[0] > 4  # without an appearance nothing can be drawn
 
 
+def test_fewer_hypotheses_than_are_tried_turned(templates):
+    """One view and one hypothesis of it: what there is, is turned."""
+    config = dataclasses.replace(TURNED, match=MatchConfig(views=1), score=ScoreConfig(resolution=28, alternates=3))
+    query, _ = problems.make_query(0)
+    found = jax.eval_shape(lambda: ipjax.estimate(templates, query, jax.random.key(0), config))
+    assert found.hypotheses.score.shape == (2 * config.align.keep,)
+
+
 @given(seed=st.integers(0, 2**31))
 def test_distinct_poses_are_the_greedy_choice(seed):
     rng = np.random.default_rng(seed)
