@@ -59,9 +59,8 @@ def estimate(
         poses, agreed, _, determined = align(pairs, size, key, config.align, diameter=diameter)
     scale_known = diameter is not None
     scene = _Scene(query, config.score.resolution, config.refine.silhouette)
-    parent = jnp.arange(poses.scale.shape[0]) // config.align.keep
     unknown = Agreement(*[jnp.zeros_like(agreed)] * 4)
-    found = _Candidates(poses, parent, determined, jnp.where(determined, agreed, -1), unknown)
+    found = _Candidates(poses, determined, jnp.where(determined, agreed, -1), unknown)
     drawing = encoder is not None and templates.appearance is not None and config.score.drawn > 0
     if config.score.ranking == "render":
         found = _rounds(templates, query, scene, found, config, scale_known=scale_known)
@@ -70,10 +69,12 @@ def estimate(
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
     best = jax.tree.map(lambda x: x[0], found)
-    matched = jax.tree.map(lambda x: x[best.parent], pairs)
-    squared = jnp.sum((best.poses @ matched.object - matched.camera) ** 2, axis=-1)
-    near = squared < (config.align.threshold * best.poses.scale) ** 2
-    used = (matched.weight > 0) & near & best.determined
+    # The pairs that speak for it are those of the view that agrees best, whichever view's hypothesis was refined to it.
+    offset = jax.vmap(lambda one: best.poses @ one.object - one.camera)(pairs)
+    squared = jnp.sum(offset**2, axis=-1)
+    near = (pairs.weight > 0) & (squared < (config.align.threshold * best.poses.scale) ** 2) & best.determined
+    view = jnp.argmax(jnp.sum(near, axis=1))
+    matched, squared, used = jax.tree.map(lambda x: x[view], (pairs, squared, near))
     count = jnp.sum(used)
     with jax.named_scope("confidence"):
         sure = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
@@ -81,7 +82,7 @@ def estimate(
         camera_from_object=best.poses,
         **sure,
         hypotheses=Hypotheses(found.poses, jnp.clip(found.score, 0, 1)),
-        view=matches.view[best.parent],
+        view=matches.view[view],
         view_score=matches.ranking,
         inliers=count,
         rmse=jnp.sqrt(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
@@ -93,7 +94,6 @@ class _Candidates(eqx.Module):
     """Poses on their way through refinement, scores and drawing."""
 
     poses: Similarity
-    parent: Int[Array, "*n"]  # the template, among those kept, whose pairs led here
     determined: Bool[Array, "*n"]
     score: Float[Array, "*n"]  # -1 = absent
     agreement: Agreement
@@ -194,13 +194,13 @@ def _rounds(
     turned = min(config.score.alternates, count)
 
     def one_round(given, _):
-        poses, parent, determined = given
+        poses, determined = given
         if config.refine.steps:
             with jax.named_scope("refine"):
                 fit = lambda pose: refine(templates.surface, scene.cloud, pose, config.refine, scale_known=scale_known)
                 poses = jax.vmap(lambda pose: fit(pose)[0])(poses)
         rated, agreement = _rate(templates, query, scene, poses, config)
-        found = _Candidates(poses, parent, determined, jnp.where(determined, rated, -1), agreement)
+        found = _Candidates(poses, determined, jnp.where(determined, rated, -1), agreement)
         if not turned:
             return given, found
         best = lax.top_k(found.score, turned)[1]
@@ -211,10 +211,9 @@ def _rounds(
         chosen = lax.top_k(promise, min(count, TURNS * turned))[1]
         there = jnp.arange(count) < chosen.shape[0]  # what fills the round up is no hypothesis of its own
         pick = lambda x: jnp.resize(x[chosen], (count, *x.shape[1:]))
-        return (jax.tree.map(pick, alternates), pick(again(parent)), pick(again(determined)) & there), found
+        return (jax.tree.map(pick, alternates), pick(again(determined)) & there), found
 
-    start = first.poses, first.parent, first.determined
-    _, found = lax.scan(one_round, start, None, length=2 if turned else 1)
+    _, found = lax.scan(one_round, (first.poses, first.determined), None, length=2 if turned else 1)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
 
@@ -244,7 +243,7 @@ def _draw_best(
         # One image at a time is fastest on a CPU; accelerators want them all.
         rated, agreement = lax.platform_dependent(kept.poses, cpu=lambda p: lax.map(rate, p), default=jax.vmap(rate))
     determined = kept.determined & ahead
-    return _Candidates(kept.poses, kept.parent, determined, jnp.where(determined, rated, -1), agreement)
+    return _Candidates(kept.poses, determined, jnp.where(determined, rated, -1), agreement)
 
 
 def distinct(

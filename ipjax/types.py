@@ -139,7 +139,7 @@ class PoseEstimate(eqx.Module):
     ambiguity: Float[Array, "*b 3"]  # the object's axis about which the rotation is least certain; length = std in rad
     agreement: Agreement  # what the confidence rests on
     hypotheses: Hypotheses  # the alternatives, the answer first
-    view: Int[Array, "*b"]  # the template whose pairs led to the answer
+    view: Int[Array, "*b"]  # the template whose pairs agree best with the answer
     view_score: Float[Array, "*b v"]  # of every template; higher is better
     inliers: Int[Array, "*b"]  # pairs of that view within the threshold
     rmse: Float[Array, "*b"]  # of those pairs, metres
