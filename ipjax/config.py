@@ -56,6 +56,9 @@ class RefineConfig(eqx.Module):
     silhouette_reach: float = 0.1  # silhouettes farther from the border than this are dropped, in diameters
     silhouette_width: float = 0.02  # of the robust loss on the distance between them, in diameters
     silhouette_weight: float = 1.6  # beside 1 for each direction of the depth association
+    deformable: bool = _static(True)  # in the end let the mesh's proportions give way, too
+    strain: float = 0.05  # their standard deviation
+    gain: float = 0.2  # share of the cost that this must save, or the mesh counts as right
 
 
 class ScoreConfig(eqx.Module):
@@ -70,6 +73,7 @@ class ScoreConfig(eqx.Module):
     drawn: int = _static(6)  # best candidates drawn and compared again, where the encoder is given; 0 = none
     depth_power: float = 0.5  # of the depth agreement of a drawn candidate; 1 for that of its features
     colour_weight: float = 0.5  # logarithm of what the correlation of colours can add to a drawn candidate
+    guess: float = 0.4  # agreement that guessed surface counts as where it is drawn, whatever it looks like
     apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters are drawn once
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
@@ -128,7 +132,7 @@ class Config(eqx.Module):
                 scale_gate=(0.0, float("inf")),
                 edge_ratio=0.0,
             ),
-            refine=RefineConfig(steps=0),
+            refine=RefineConfig(steps=0, deformable=False),
             score=ScoreConfig(ranking="inliers"),
         )
 

@@ -68,6 +68,8 @@ def estimate(
             found = _draw_best(encoder, templates, query, scene, found, config)
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
+    if config.refine.deformable and config.refine.steps:
+        found = _allow_for_a_wrong_mesh(templates, scene, found, config, scale_known=scale_known)
     best = jax.tree.map(lambda x: x[0], found)
     # The pairs that speak for it are those of the view that agrees best, whichever view's hypothesis was refined to it.
     offset = jax.vmap(lambda one: best.poses @ one.object - one.camera)(pairs)
@@ -97,6 +99,17 @@ class _Candidates(eqx.Module):
     determined: Bool[Array, "*n"]
     score: Float[Array, "*n"]  # -1 = absent
     agreement: Agreement
+
+
+def _allow_for_a_wrong_mesh(
+    templates: Templates, scene: "_Scene", found: _Candidates, config: Config, *, scale_known: bool
+) -> _Candidates:
+    """The same, the first of them refined with a mesh whose proportions may give way."""
+    with jax.named_scope("deform"):
+        best = jax.tree.map(lambda x: x[0], found.poses)
+        moved, _ = refine(templates.surface, scene.cloud, best, config.refine, scale_known=scale_known, deformable=True)
+    poses = jax.tree.map(lambda all_of_them, first: all_of_them.at[0].set(first), found.poses, moved)
+    return eqx.tree_at(lambda f: f.poses, found, poses)
 
 
 def _certainty(

@@ -3,7 +3,8 @@
 Both directions are associated: surface points with the depth they project to, and depth points with their nearest
 surface point. One direction alone lets a free scale shrink or grow the object along the rays. The object's silhouette
 is fitted to the mask's border, which fixes the size that depth leaves loose; surface that projects beside the mask
-costs as much as a point can. Neither counts where something hides the object.
+costs as much as a point can. Neither counts where something hides the object. A mesh may be wrong: at the
+end its proportions give way where the image insists, so that nothing is turned or moved to make up for them.
 """
 
 import functools
@@ -95,6 +96,7 @@ def refine(
     config: RefineConfig = RefineConfig(),
     *,
     scale_known: bool = False,
+    deformable: bool = False,
 ) -> tuple[Similarity, Float[Array, ""]]:
     """Improve one hypothesis; the caller vmaps.
 
@@ -103,26 +105,51 @@ def refine(
       cloud: the masked depth, and what lies around it.
       camera_from_object: the hypothesis.
       scale_known: leave the scale as it is (SE(3) instead of Sim(3)).
+      deformable: let the proportions of the surface give way. They explain a wrong pose, too, so this is for the last
+        step only, and what comes of it is taken only if the cost falls by ``config.gain``.
 
     Returns:
-      The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1].
+      The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1]. For a
+      deformable surface it is the cost in the better proportions, which are not returned.
     """
     start = camera_from_object
+    size, strains = 6 if scale_known else 7, 5 if deformable else 0
+    weight = 2 + jnp.asarray(config.silhouette_weight, start.translation.dtype)  # of all terms together
 
     def residuals(step, _):
-        together = _residuals(retract(start, step), surface, cloud, config)
-        # So that the mean square is in [0, 1].
-        return together * jnp.sqrt(together.shape[0] / (2 + jnp.asarray(config.silhouette_weight, together.dtype)))
+        moved, strain = retract(start, step[:size]), step[size:]
+        together = _residuals(moved, strained(surface, strain) if deformable else surface, cloud, config)
+        together = together * jnp.sqrt(together.shape[0] / weight)  # so that the mean square is in [0, 1]
+        if not deformable:
+            return together
+        # One standard deviation costs as much as if a hundredth of the surface were lost.
+        prior = strain / config.strain * jnp.sqrt(0.01 * together.shape[0] / weight)
+        return jnp.concatenate([together, prior])
 
-    count = 6 if scale_known else 7
-    zero = jnp.zeros(count, start.translation.dtype)
+    zero = jnp.zeros(size + strains, start.translation.dtype)
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalCholesky())
     solution = optx.least_squares(residuals, solver, zero, max_steps=config.steps, throw=False)
-    before = jnp.mean(residuals(zero, None) ** 2)
-    after = jnp.mean(residuals(solution.value, None) ** 2)
-    better = jnp.isfinite(after) & (after < before)
+    first, last = residuals(zero, None), residuals(solution.value, None)
+    count = first.shape[0] - strains  # the prior adds to the cost but is no residual of the image
+    before, after = jnp.sum(first**2) / count, jnp.sum(last**2) / count
+    wanted = before * (1 - config.gain) if deformable else before
+    better = jnp.isfinite(after) & (after < wanted)
     step = jnp.where(better, solution.value, zero)
-    return retract(start, step), jnp.where(better, after, before)
+    return retract(start, step[:size]), jnp.where(better, after, before)
+
+
+def strained(surface: Surface, strain: Float[Array, "5"]) -> Surface:
+    """The surface with its proportions changed: ``x + E x``, E small, symmetric, and without a trace (the scale).
+
+    Args:
+      strain: E11, E22, E12, E13, E23, in the object's frame.
+    """
+    a, b, ab, ac, bc = strain
+    matrix = jnp.stack([jnp.stack([a, ab, ac]), jnp.stack([ab, b, bc]), jnp.stack([ac, bc, -a - b])])
+    times = lambda x: jnp.sum(x[:, :, None] * matrix, axis=1)
+    normals = surface.normals - times(surface.normals)
+    normals = normals / jnp.sqrt(jnp.sum(normals**2, axis=-1, keepdims=True))
+    return eqx.tree_at(lambda s: (s.points, s.normals), surface, (surface.points + times(surface.points), normals))
 
 
 def information(

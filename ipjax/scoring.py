@@ -47,7 +47,10 @@ def score(
         total = geometry * features**config.power
     else:
         drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
-        total = geometry**config.depth_power * features * drawn * jnp.exp(config.colour_weight * (colour - 1))
+        # What a guessed surface looks like says little, be it like the photo or unlike it.
+        trust = seen_share(templates.surface, camera_from_object)
+        looks = trust * drawn + (1 - trust) * config.guess
+        total = geometry**config.depth_power * features * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
     return total, Agreement(geometry, features, drawn, jnp.zeros_like(geometry))
 
 
@@ -76,6 +79,17 @@ def depth_agreement(
     occluded = seen & ~mask & (~known | (gap < tolerance))
     union = (seen & ~occluded) | (mask & known)
     return jnp.sum(agree) / jnp.maximum(jnp.sum(union), 1)
+
+
+def seen_share(surface: Surface, camera_from_object: Similarity) -> Float[Array, ""]:
+    """How much of the surface that a hypothesis shows the camera was seen by the reconstruction; the rest is guessed.
+
+    By area in the image; what the object itself hides counts, too.
+    """
+    placed = camera_from_object @ surface.points
+    facing = -jnp.sum(_turn_normals(camera_from_object, surface.normals) * placed, axis=-1)
+    area = jnp.maximum(facing, 0) / jnp.maximum(jnp.sum(placed * placed, axis=-1), 1e-12) ** 1.5
+    return jnp.sum(area * surface.seen) / jnp.maximum(jnp.sum(area), 1e-12)
 
 
 def closeness(templates: Templates, camera_from_object: Similarity) -> Float[Array, "v"]:
@@ -230,8 +244,11 @@ def _facing(
     placed: Float[Array, "n 3"], normals: Float[Array, "n 3"], camera_from_object: Similarity
 ) -> Bool[Array, "n"]:
     """Which of the points placed in the camera frame show it their front."""
-    turned = jnp.sum(camera_from_object.rotation[None] * normals[:, None, :], axis=-1)
-    return jnp.sum(turned * placed, axis=-1) < 0
+    return jnp.sum(_turn_normals(camera_from_object, normals) * placed, axis=-1) < 0
+
+
+def _turn_normals(camera_from_object: Similarity, normals: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    return jnp.sum(camera_from_object.rotation[None] * normals[:, None, :], axis=-1)
 
 
 def _patch_cover(pixels: Bool[Array, "h w"], rows: int, columns: int) -> Float[Array, "p"]:

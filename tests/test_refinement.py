@@ -1,5 +1,7 @@
 """Refinement on an exact depth image: it finds back, never worsens, and its linear algebra is right."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,13 +18,14 @@ from ipjax.refinement import (
     refine,
     retract,
     rotation_from_vector,
+    strained,
     trace_contour,
 )
 from ipjax.types import Camera
 
 GRID = 56  # as the defaults have it
 CONFIG = RefineConfig(steps=15, points=256)
-run = jax.jit(refine, static_argnames="scale_known")
+run = jax.jit(refine, static_argnames=("scale_known", "deformable"))
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +89,54 @@ def test_a_known_scale_stays(scene, seed):
     found, _ = run(surface, cloud, retract(truth, step), CONFIG, scale_known=True)
     assert float(found.scale) == float(truth.scale)
     np.testing.assert_allclose(found.rotation @ found.rotation.T, np.eye(3), atol=1e-5)
+
+
+def test_wrong_proportions_give_way(scene):
+    """A body too flat and too long by a tenth: whoever trusts it turns and moves it farther from the truth."""
+    surface, cloud, truth = scene
+    stretch = jnp.array([1.0, 0.9, 1.1])
+    normals = surface.normals / stretch
+    wrong = dataclasses.replace(
+        surface,
+        points=surface.points * stretch,
+        normals=normals / jnp.linalg.norm(normals, axis=-1, keepdims=True),
+    )
+    off = lambda pose: float(jnp.linalg.norm(pose @ surface.points - truth @ surface.points, axis=-1).mean())
+    trusted, doubted = [], []
+    for seed in range(20):
+        direction = np.random.default_rng(seed).normal(size=7)
+        step = np.concatenate([0.1 * direction[:3] / np.linalg.norm(direction[:3]), 0.02 * direction[3:6], [0.0]])
+        rigid, before = run(wrong, cloud, retract(truth, jnp.asarray(step, jnp.float32)), CONFIG)
+        found, after = run(wrong, cloud, rigid, CONFIG, deformable=True)
+        assert float(after) <= float(before) + 1e-6
+        trusted.append(off(rigid))
+        doubted.append(off(found))
+    assert np.median(doubted) < 0.6 * np.median(trusted)
+
+
+def test_right_proportions_are_left_alone(scene):
+    """Where a deformation gains little the pose stays, to the last bit."""
+    surface, cloud, truth = scene
+    fitted, cost = run(surface, cloud, truth, CONFIG)
+    again, after = run(surface, cloud, fitted, CONFIG, deformable=True)
+    np.testing.assert_allclose(float(after), float(cost), rtol=1e-4)
+    np.testing.assert_array_equal(again.translation, fitted.translation)
+    np.testing.assert_allclose(again.rotation, fitted.rotation, atol=1e-6)
+
+
+@given(seed=st.integers(0, 2**31))
+def test_a_strain_keeps_volume_and_normals(seed):
+    """To first order; and the normals stay those of the changed surface."""
+    surface = problems.make_surface(500)
+    strain = np.random.default_rng(seed).normal(size=5) * 0.01
+    a, b, ab, ac, bc = strain
+    matrix = np.eye(3) + np.array([[a, ab, ac], [ab, b, bc], [ac, bc, -a - b]])
+    changed = strained(surface, jnp.asarray(strain, jnp.float32))
+    assert abs(np.linalg.det(matrix) - 1) < 3 * np.sum(strain**2)
+    np.testing.assert_allclose(changed.points, surface.points @ matrix.T, atol=1e-6)
+    exact = np.asarray(surface.normals) @ np.linalg.inv(matrix)
+    exact /= np.linalg.norm(exact, axis=-1, keepdims=True)
+    np.testing.assert_allclose(changed.normals, exact, atol=10 * np.sum(strain**2) + 1e-6)
 
 
 def test_without_depth_nothing_moves(scene):

@@ -21,6 +21,8 @@ from ipjax.scoring import (
     drawn_agreement,
     feature_agreement,
     look_along,
+    score,
+    seen_share,
 )
 from ipjax.types import Camera
 
@@ -194,3 +196,33 @@ def test_colours_tell_what_features_cannot(case):
     wrong = drawn_agreement(blind, paint([0.1, 0.2, 0.8], [0.8, 0.2, 0.1]), painted, truth, CONFIG)
     assert float(right[1]) > 0.7 and float(wrong[1]) < -0.7
     assert float(right[0]) == pytest.approx(float(wrong[0]), abs=1e-5)
+
+
+def test_the_seen_share_of_a_half_guessed_body(templates, case):
+    """Seen from its known side, from its guessed side, and from between them."""
+    *_, truth = case
+    surface = templates.surface
+    eye = -(truth.rotation.T @ truth.translation) / truth.scale
+    toward = surface.points @ eye > 0
+    of = lambda seen: float(seen_share(dataclasses.replace(surface, seen=jnp.where(seen, 1.0, 0.0)), truth))
+    assert of(toward) > 0.9 and of(~toward) < 0.1
+    assert of(toward) + of(~toward) == pytest.approx(1, abs=1e-5)
+    beside = jnp.cross(eye, jnp.array([0.3, 0.5, 0.7]))
+    assert 0.35 < of(surface.points @ beside > 0) < 0.65
+    assert of(jnp.ones_like(toward)) == pytest.approx(1, abs=1e-6)
+
+
+def test_guessed_surface_is_judged_by_its_shape_alone(templates, case):
+    """Painted in the wrong colours, a body that was seen loses to a guessed one; in the right ones it wins."""
+    query, depth, mask, camera, truth = case
+    encoder = problems.make_encoder()
+    appearance = problems.make_appearance(20_000)
+    wrong = dataclasses.replace(appearance, colours=appearance.colours[::-1])
+
+    def rate(look, seen):
+        surface = dataclasses.replace(templates.surface, seen=jnp.full(len(templates.surface.seen), seen))
+        known = dataclasses.replace(templates, surface=surface, appearance=look)
+        return float(score(known, query, depth, mask, camera, truth, CONFIG, encoder=encoder)[0])
+
+    assert rate(wrong, 0.0) == pytest.approx(rate(appearance, 0.0), rel=1e-5)
+    assert rate(wrong, 1.0) < rate(wrong, 0.0) < rate(appearance, 1.0)
