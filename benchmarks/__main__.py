@@ -14,13 +14,14 @@ from benchmarks.table import render
 
 def benchmarks():
     """Name → function of ``quick`` that yields rows."""
-    from benchmarks import geometry, neighbours, stages
+    from benchmarks import geometry, neighbours, queries, stages
 
     return {
         "neighbours": neighbours.rows,
         "umeyama": geometry.umeyama_rows,
         "consensus": geometry.consensus_rows,
         "estimate": stages.rows,
+        "query": queries.rows,
     }
 
 

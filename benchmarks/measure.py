@@ -13,10 +13,9 @@ import jax
 
 
 def compile_fresh(function: Callable, *arguments) -> tuple[Callable, float, int]:
-    """The compiled function, the seconds its compilation took, and the bytes of its temporary arrays."""
-    lowered = jax.jit(function).lower(*arguments)
+    """The compiled function, the seconds that tracing and compiling it took, and the bytes of its temporary arrays."""
     start = time.perf_counter()
-    compiled = lowered.compile()
+    compiled = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - start
     memory = compiled.memory_analysis()
     return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1

@@ -26,7 +26,7 @@ COLUMNS = {
 }
 
 
-SHORT = ("what", "how", "size", "median", "temporary", "ratio")
+SHORT = ("what", "how", "size", "median", "compile", "temporary", "ratio")
 SIZES = ("400 × 256² × 384", "50 × 576² × 384", "25 × 900² × 384")
 
 

@@ -184,9 +184,11 @@ def drawn_agreement(
 def chroma_correlation(
     first: Float[Array, "p 3"], second: Float[Array, "p 3"], weight: Float[Array, "p"]
 ) -> Float[Array, ""]:
-    """How alike colours are spread over two images, whatever their brightness and tint: in [-1, 1], 0 if one is grey.
+    """How alike colours are spread over two images, whatever their light, shade and tint: in [-1, 1], 0 if one is grey.
 
     The encoder's features hardly tell colours, and a reconstruction that has lost its sharp texture still has them.
+    Each colour is taken relative to its brightness, or a thing that is red all over would show in its chroma where the
+    light fell, which was elsewhere when it was reconstructed.
 
     Args:
       first, second: mean colours of the patches, in [0, 1].
@@ -194,7 +196,8 @@ def chroma_correlation(
     """
 
     def deviation(colours):
-        chroma = colours - jnp.mean(colours, axis=-1, keepdims=True)
+        brightness = jnp.mean(colours, axis=-1, keepdims=True)
+        chroma = (colours - brightness) / (brightness + _DARK)
         return chroma - mean(chroma)
 
     mean = lambda x: jnp.sum(x * weight[:, None], axis=0) / jnp.maximum(jnp.sum(weight), 1e-6)
@@ -203,7 +206,8 @@ def chroma_correlation(
     return jnp.sum(mean(a * b)) / (variance + _GREY)
 
 
-_GREY = 5e-4  # variance of chroma below which it is the camera's noise
+_DARK = 0.3  # brightness below which colours count less, for they drown in noise
+_GREY = 1.5e-3  # variance of chroma below which it is the camera's noise
 
 
 def _patch_colour(
