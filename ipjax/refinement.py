@@ -129,9 +129,10 @@ def refine(
     zero = jnp.zeros(size + strains, start.translation.dtype)
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalCholesky())
     solution = optx.least_squares(residuals, solver, zero, max_steps=config.steps, throw=False)
-    first, last = residuals(zero, None), residuals(solution.value, None)
-    count = first.shape[0] - strains  # the prior adds to the cost but is no residual of the image
-    before, after = jnp.sum(first**2) / count, jnp.sum(last**2) / count
+    # Both at once, so that they are compiled once.
+    ends = jax.vmap(lambda step: residuals(step, None))(jnp.stack([zero, solution.value]))
+    count = ends.shape[1] - strains  # the prior adds to the cost but is no residual of the image
+    before, after = jnp.sum(ends**2, axis=1) / count
     wanted = before * (1 - config.gain) if deformable else before
     better = jnp.isfinite(after) & (after < wanted)
     step = jnp.where(better, solution.value, zero)
