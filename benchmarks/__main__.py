@@ -29,7 +29,8 @@ def benchmarks():
 def main():
     available = benchmarks()
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.split("\n")[0])
-    parser.add_argument("--only", choices=list(available), action="append", help="measure this one; may be repeated")
+    only = "measure this one; may be repeated; without it, all but query"
+    parser.add_argument("--only", choices=list(available), action="append", help=only)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the results here")
     parser.add_argument("--quick", action="store_true", help="small sizes, few runs: does it work?")
     parser.add_argument("--trace", type=Path, metavar="FOLDER", help="write a profile of warm estimates here instead")
