@@ -1,4 +1,4 @@
-"""A whole query as `ipjax estimate` makes it: a crop of 224 pixels described by DINOv2 S/14, estimated, and drawn.
+"""A whole query from its crop on, as `ipjax estimate` makes it: 224 pixels described by DINOv2 S/14, estimated, drawn.
 
 Its weights are random, for times do not depend on them. So that the poses are sensible ones all the same, the features
 that count are those of the tests' encoder; DINOv2's are computed and added with a weight of 1e-12.
@@ -25,7 +25,7 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the sy
 import problems
 
 BLOCK = 8  # whose features are the default
-SEEN_AS = "vits14"
+PRESET = "vits14"
 
 
 class Both(eqx.Module):
@@ -60,7 +60,7 @@ def rows(quick: bool):
             ("Config(), bfloat16 encoder", Config(), "bfloat16", None),
         ]
     for name, config, dtype, size in forms:
-        shape = dataclasses.replace(tiny, dtype=dtype) if quick else find_preset(SEEN_AS, dtype)
+        shape = dataclasses.replace(tiny, dtype=dtype) if quick else find_preset(PRESET, dtype)
         model = DinoV2(shape, rngs=nnx.Rngs(0))
         encoder = Both(problems.make_encoder(channels), Encoder(model, min(BLOCK, shape.depth - 1)))
         arguments = encoder, templates, query.view, key, config, size

@@ -132,7 +132,7 @@ class Config(eqx.Module):
                 scale_gate=(0.0, float("inf")),
                 edge_ratio=0.0,
             ),
-            refine=RefineConfig(steps=0, deformable=False),
+            refine=RefineConfig(steps=0),
             score=ScoreConfig(ranking="inliers"),
         )
 

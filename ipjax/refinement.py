@@ -3,8 +3,8 @@
 Both directions are associated: surface points with the depth they project to, and depth points with their nearest
 surface point. One direction alone lets a free scale shrink or grow the object along the rays. The object's silhouette
 is fitted to the mask's border, which fixes the size that depth leaves loose; surface that projects beside the mask
-costs as much as a point can. Neither counts where something hides the object. A mesh may be wrong: at the
-end its proportions give way where the image insists, so that nothing is turned or moved to make up for them.
+costs as much as a point can. Neither counts where something hides the object. A mesh may be wrong: at the end its
+proportions give way where the image insists, so that less is turned or moved to make up for them.
 """
 
 import functools

@@ -326,17 +326,14 @@ def test_time_that_another_has_spent_is_counted(small, tmp_path):
     assert "Note: told the size." in found.table()
 
 
-def test_results_hang_on_the_code():
+def test_results_hang_on_the_code(monkeypatch):
     """Every file whose change can change an estimate is in the hash; none of those that only print or score."""
     code = studies.hash_code()
     assert re.fullmatch("[0-9a-f]{12}", code) and code == studies.hash_code()
     read: list[str] = []
-    path, opened = Path, Path.read_bytes
-    try:
-        path.read_bytes = lambda self: (read.append(self.name), opened(self))[1]  # type: ignore[method-assign]
-        studies.hash_code()
-    finally:
-        path.read_bytes = opened  # type: ignore[method-assign]
+    opened = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda self: (read.append(self.name), opened(self))[1])
+    studies.hash_code()
     stages = {f"{n}.py" for n in ("pipeline", "matching", "alignment", "refinement", "scoring", "config", "frames")}
     assert stages | {"neighbours.py", "consensus.py", "rasterize.py"} <= set(read)
     assert not {"cli.py", "evaluation.py", "metrics.py"} & set(read)

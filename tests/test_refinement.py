@@ -115,7 +115,7 @@ def test_wrong_proportions_give_way(scene):
 
 
 def test_right_proportions_are_left_alone(scene):
-    """Where a deformation gains little the pose stays, to the last bit."""
+    """Where a deformation gains little the pose stays as it is."""
     surface, cloud, truth = scene
     fitted, cost = run(surface, cloud, truth, CONFIG)
     again, after = run(surface, cloud, fitted, CONFIG, deformable=True)

@@ -297,7 +297,7 @@ def _grabcut(rgb: np.ndarray, *, box=None, click=None) -> np.ndarray:
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     try:
-        cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), state, None, *models, 6, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+        cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), state, (0, 0, 0, 0), *models, 6, cv2.GC_INIT_WITH_MASK)
     except cv2.error:
         raise ForegroundError(
             "GrabCut found no difference between the object and its background; give a mask"

@@ -475,7 +475,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             if "ipjax" not in metadata:
                 raise ValueError(f"{path}: a safetensors file, but not an object file; make one with 'ipjax onboard'")
             header = _parse_header(metadata["ipjax"], path)
-            slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118 (not a dictionary)
+            names = file.keys()  # of a file that is no dictionary
+            slices = {name: file.get_slice(name) for name in names}
             _check_shapes(
                 {
                     name: (types.get(str(s.get_dtype()), str(s.get_dtype())), tuple(s.get_shape()))
