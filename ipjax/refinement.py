@@ -112,31 +112,57 @@ def refine(
       The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1]. For a
       deformable surface it is the cost in the better proportions, which are not returned.
     """
-    start = camera_from_object
-    size, strains = 6 if scale_known else 7, 5 if deformable else 0
-    weight = 2 + jnp.asarray(config.silhouette_weight, start.translation.dtype)  # of all terms together
+    start, rigid = camera_from_object, 6 if scale_known else 7
+    zero = jnp.zeros(rigid + (5 if deformable else 0), start.translation.dtype)
 
-    def residuals(step, _):
-        moved, strain = retract(start, step[:size]), step[size:]
-        together = _residuals(moved, strained(surface, strain) if deformable else surface, cloud, config)
-        together = together * jnp.sqrt(together.shape[0] / weight)  # so that the mean square is in [0, 1]
-        if not deformable:
-            return together
-        # One standard deviation costs as much as if a hundredth of the surface were lost.
-        prior = strain / config.strain * jnp.sqrt(0.01 * together.shape[0] / weight)
-        return jnp.concatenate([together, prior])
+    def linear(step, _):
+        here = lax.stop_gradient(step)
+        value, slopes = _linearise(start, here, surface, cloud, config, rigid=rigid)
+        return value + jnp.sum(slopes * (step - here), axis=1)
 
-    zero = jnp.zeros(size + strains, start.translation.dtype)
+    def cost(values):  # the prior adds to it but is no residual of the image
+        return jnp.sum(values**2) / (values.shape[0] - (zero.shape[0] - rigid))
+
+    before = cost(_linearise(start, zero, surface, cloud, config, rigid=rigid)[0])
+    if not config.steps:
+        return start, before
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalCholesky())
-    solution = optx.least_squares(residuals, solver, zero, max_steps=config.steps, throw=False)
-    # Both at once, so that they are compiled once.
-    ends = jax.vmap(lambda step: residuals(step, None))(jnp.stack([zero, solution.value]))
-    count = ends.shape[1] - strains  # the prior adds to the cost but is no residual of the image
-    before, after = jnp.sum(ends**2, axis=1) / count
+    solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
+    after = cost(solution.state.f_info.residual)
     wanted = before * (1 - config.gain) if deformable else before
     better = jnp.isfinite(after) & (after < wanted)
     step = jnp.where(better, solution.value, zero)
-    return retract(start, step[:size]), jnp.where(better, after, before)
+    return retract(start, step[:rigid]), jnp.where(better, after, before)
+
+
+@functools.partial(jax.jit, static_argnames="rigid")  # so that it is traced once
+def _linearise(
+    start: Similarity,
+    step: Float[Array, "n"],
+    surface: Surface,
+    cloud: Cloud,
+    config: RefineConfig,
+    *,
+    rigid: int,
+) -> tuple[Float[Array, "r"], Float[Array, "r n"]]:
+    """The residuals after a step of ``rigid`` coordinates of :func:`retract` and then strains, and their slopes.
+
+    All slopes at once: left to the solver, they are a function that it carries through its loop, which takes twice as
+    long to compile.
+    """
+
+    def residuals(step):
+        moved, strain = retract(start, step[:rigid]), step[rigid:]
+        deformed = strained(surface, strain) if strain.shape[0] else surface
+        values = _residuals(moved, deformed, cloud, config)
+        # So that the mean square is in [0, 1].
+        spread = jnp.sqrt(values.shape[0] / (2 + jnp.asarray(config.silhouette_weight, step.dtype)))
+        # One standard deviation costs as much as if a hundredth of the surface were lost.
+        values = jnp.concatenate([values * spread, strain / config.strain * (0.1 * spread)])
+        return values, values
+
+    slopes, values = jax.jacfwd(residuals, has_aux=True)(step)
+    return values, slopes
 
 
 def strained(surface: Surface, strain: Float[Array, "5"]) -> Surface:
@@ -161,9 +187,10 @@ def information(
     Each kind of residual (surface to depth, depth to surface, silhouette) is averaged: their number does not matter.
     """
     zero = jnp.zeros(7, camera_from_object.translation.dtype)
-    residuals = lambda step: _residuals(retract(camera_from_object, step), surface, cloud, config)
-    slopes = jax.jacfwd(residuals)(zero)
-    return jnp.sum(slopes[:, :, None] * slopes[:, None, :], axis=0), jnp.sum(residuals(zero) ** 2)
+    values, slopes = _linearise(camera_from_object, zero, surface, cloud, config, rigid=7)
+    # Its terms add up to the mean square, here to the sum.
+    share = (2 + jnp.asarray(config.silhouette_weight, zero.dtype)) / values.shape[0]
+    return jnp.sum(slopes[:, :, None] * slopes[:, None, :], axis=0) * share, jnp.sum(values**2) * share
 
 
 def retract(start: Similarity, step: Float[Array, "n"]) -> Similarity:

@@ -1,36 +1,32 @@
 """Small symmetric positive-definite systems in plain arithmetic: no call to LAPACK or cuSOLVER."""
 
-import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n"]) -> Float[Array, "n"]:
-    """Solve a small symmetric positive-definite system by LDLᵀ, unrolled; singular directions get a zero."""
+    """Solve a small symmetric positive-definite system; singular directions get a zero."""
+    return _eliminate(matrix, right[:, None])[:, 0]
+
+
+def _eliminate(matrix, right):
+    """Gauss and Jordan's elimination, which needs no pivoting here. A loop, not unrolled, to compile fast."""
     size = matrix.shape[0]
     floor = 1e-9 * jnp.max(jnp.abs(matrix)) + 1e-30
-    lower: list[list[Array]] = []
-    pivots: list[Array] = []
-    for row in range(size):
-        entries: list[Array] = []
-        for column in range(row):
-            inner = sum(entries[k] * lower[column][k] * pivots[k] for k in range(column))
-            entries.append((matrix[row, column] - inner) / pivots[column])
-        pivots.append(jnp.maximum(matrix[row, row] - sum(entries[k] ** 2 * pivots[k] for k in range(row)), floor))
-        lower.append(entries)
-    forward: list[Array] = []
-    for row in range(size):
-        forward.append(right[row] - sum(lower[row][k] * forward[k] for k in range(row)))
-    solution: list[Array] = [right[0]] * size
-    for row in reversed(range(size)):
-        rest = sum(lower[k][row] * solution[k] for k in range(row + 1, size))
-        solution[row] = forward[row] / pivots[row] - rest
-    return jnp.stack(solution)
+    rows = jnp.arange(size)
+
+    def clear(step, table):
+        pivot = table[step] / jnp.maximum(table[step, step], floor)
+        rest = table - table[:, step, None] * pivot
+        return jnp.where((rows == step)[:, None], pivot, rest)
+
+    return lax.fori_loop(0, size, clear, jnp.concatenate([matrix, right], axis=1))[:, size:]
 
 
 def invert_positive(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """The inverse of a small symmetric positive-definite matrix; singular directions get large finite values."""
-    columns = jax.vmap(solve_positive, (None, 0))(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype))
+    columns = _eliminate(matrix, jnp.eye(matrix.shape[0], dtype=matrix.dtype))
     return (columns + columns.T) / 2
 
 
