@@ -12,6 +12,7 @@ prints what fits best; with --page it also writes the held-out figures and the r
 """
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 
@@ -22,7 +23,9 @@ from benchmarks.measure import commit
 from benchmarks.photo_pairs import states
 from ipjax.config import ConfidenceConfig
 from ipjax.host.bop import write_atomically
+from ipjax.types import Agreement
 
+PARTS = len(dataclasses.fields(Agreement))
 RIGHT = 0.1  # of the diameter: the mean distance of surface points below which a pose counts as right
 
 
@@ -30,6 +33,8 @@ def read(paths: list[Path]) -> list[dict]:
     """The lines of objects made in code, in the order in which they were written."""
     rows = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
     rows = [row for row in rows if "agreement" in row and " obj_" not in row["key"][1]]
+    if any(len(row["agreement"]) != PARTS for row in rows):
+        raise SystemExit("some lines are of another version, which told other parts: run benchmarks.photo_pairs again")
     if not rows:
         raise SystemExit("no line is of an object made in code with an agreement: run benchmarks.photo_pairs synthetic")
     return rows
@@ -43,14 +48,15 @@ def split(rows: list[dict]) -> tuple[list[dict], list[dict]]:
 
 
 def cases(rows: list[dict], *, drawn: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the regression sees [n 5], whether the pose is right [n], and whether the object was there at all [n]."""
+    """What the regression sees [n 7], whether the pose is right [n], and whether the object was there at all [n]."""
     seen = [(row["agreement"], row["add"] < RIGHT, True) for row in rows]
     seen += [(row["absent"]["agreement"], False, False) for row in rows if "agreement" in row.get("absent", {})]
     parts = np.array([agreement for agreement, _, _ in seen])
     logs = np.log(np.clip(parts[:, :3], 1e-3, 1))
+    others = parts[:, 3:].copy()
     if not drawn:
-        logs[:, 2] = 0
-    features = np.concatenate([np.ones((len(parts), 1)), logs, parts[:, 3:]], axis=1)
+        logs[:, 2] = others[:, 0] = 0
+    features = np.concatenate([np.ones((len(parts), 1)), logs, others], axis=1)
     return features, np.array([right for _, right, _ in seen]), np.array([there for _, _, there in seen])
 
 

@@ -322,10 +322,10 @@ def judge(group: Group, method: str, estimator, query: Shot) -> dict:
 
 def certainty(estimate) -> dict:
     """What an estimate says of itself."""
-    parts = estimate.agreement
+    parts = [getattr(estimate.agreement, part.name) for part in dataclasses.fields(estimate.agreement)]
     return {
         "confidence": float(estimate.confidence),
-        "agreement": [float(x) for x in (parts.depth, parts.features, parts.drawn, parts.rival)],
+        "agreement": [float(x) for x in parts],
         "ambiguity_deg": float(np.degrees(np.linalg.norm(np.asarray(estimate.ambiguity)))),
     }
 

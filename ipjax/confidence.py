@@ -11,18 +11,19 @@ from ipjax.config import ConfidenceConfig
 from ipjax.types import Agreement, Pairs, Similarity
 
 
-def probability(agreement: Agreement, weights: Float[Array, "5"]) -> Float[Array, ""]:
+def probability(agreement: Agreement, weights: Float[Array, "7"]) -> Float[Array, ""]:
     """The probability that a pose is right, by logistic regression on its agreement with the query.
 
     Right means that the mean distance between the object's surface points at the estimate and at the truth (to the
     nearest point, for objects with symmetries) is below a tenth of the diameter: ADD(-S) < 0.1 d.
 
     Args:
-      weights: of 1, the logarithms of the agreement in depth, features and drawing, and the rival.
+      weights: of 1, the logarithms of the agreement in depth, features and drawing, the colours, how much of the
+        surface was seen, and the rival.
     """
     part = lambda x: jnp.log(jnp.clip(x, 1e-3, 1))
     known = [jnp.ones_like(agreement.depth), part(agreement.depth), part(agreement.features), part(agreement.drawn)]
-    logit = jnp.sum(weights * jnp.stack([*known, agreement.rival]))
+    logit = jnp.sum(weights * jnp.stack([*known, agreement.colour, agreement.seen, agreement.rival]))
     return 1 / (1 + jnp.exp(-jnp.clip(logit, -30, 30)))
 
 

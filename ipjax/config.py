@@ -81,8 +81,8 @@ class ScoreConfig(eqx.Module):
 class ConfidenceConfig(eqx.Module):
     """From agreement to a probability and a covariance; most of it fitted by ``python -m benchmarks.calibration``."""
 
-    drawn: tuple[float, float, float, float, float] = (8.31, 0.95, 1.45, 6.74, -5.38)  # see ``confidence.probability``
-    undrawn: tuple[float, float, float, float, float] = (9.59, 1.53, 6.61, 0.0, -6.84)  # where no candidate was drawn
+    drawn: tuple[float, ...] = (8.31, 0.95, 1.45, 6.74, 0.0, 0.0, -5.38)  # see ``confidence.probability``
+    undrawn: tuple[float, ...] = (9.59, 1.53, 6.61, 0.0, 0.0, 0.0, -6.84)  # where no candidate was drawn
     least: float = 0.5  # confidence below which the object is not here, or not seen well enough
     independent: float = 10.3  # independent residuals of refinement
     pair_share: float = 0.025  # of the pairs that are independent

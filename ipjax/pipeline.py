@@ -16,7 +16,7 @@ from ipjax.config import Config
 from ipjax.features import lift, object_features
 from ipjax.matching import match, select
 from ipjax.refinement import Cloud, information, refine, trace_contour
-from ipjax.scoring import score
+from ipjax.scoring import score, seen_share
 from ipjax.types import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
 
 
@@ -59,7 +59,8 @@ def estimate(
         poses, agreed, _, determined = align(pairs, size, key, config.align, diameter=diameter)
     scale_known = diameter is not None
     scene = _Scene(query, config.score.resolution, config.refine.silhouette)
-    unknown = Agreement(*[jnp.zeros_like(agreed)] * 4)
+    unknown = jnp.zeros_like(agreed)
+    unknown = Agreement(unknown, unknown, unknown, unknown, unknown, unknown)
     found = _Candidates(poses, determined, jnp.where(determined, agreed, -1), unknown)
     drawing = encoder is not None and templates.appearance is not None and config.score.drawn > 0
     if config.score.ranking == "render":
@@ -129,7 +130,8 @@ def _certainty(
     # Not the score: the numbers that turn this into a probability outlive a change of its formula.
     evidence = parts.depth * parts.features * parts.drawn if drawing else found.score
     rival = find_rival(found.poses, jnp.where(found.score > 0, evidence, 0))
-    agreement = eqx.tree_at(lambda a: a.rival, best.agreement, rival)
+    seen = seen_share(templates.surface, best.poses)
+    agreement = eqx.tree_at(lambda a: (a.seen, a.rival), best.agreement, (seen, rival))
     if config.score.ranking == "render":
         weights = config.confidence.drawn if drawing else config.confidence.undrawn
         weights = jnp.stack([jnp.asarray(x, found.score.dtype) for x in weights])

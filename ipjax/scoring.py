@@ -43,7 +43,7 @@ def score(
     geometry = depth_agreement(templates.surface, depth, mask, camera, camera_from_object, config)
     features = feature_agreement(templates, query, camera_from_object, config)
     if encoder is None:
-        drawn = jnp.ones_like(geometry)
+        drawn, colour = jnp.ones_like(geometry), jnp.zeros_like(geometry)
         total = geometry * features**config.power
     else:
         drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
@@ -51,7 +51,8 @@ def score(
         trust = seen_share(templates.surface, camera_from_object)
         looks = trust * drawn + (1 - trust) * config.guess
         total = geometry**config.depth_power * features * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
-    return total, Agreement(geometry, features, drawn, jnp.zeros_like(geometry))
+    later = jnp.zeros_like(geometry)  # what only the chosen one needs
+    return total, Agreement(geometry, features, drawn, colour, seen=later, rival=later)
 
 
 def depth_agreement(

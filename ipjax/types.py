@@ -119,11 +119,13 @@ class Hypotheses(eqx.Module):
 
 
 class Agreement(eqx.Module):
-    """How well a pose explains the query, part by part; each in [0, 1], 0 where candidates are not scored."""
+    """How well a pose explains the query, part by part; each but `colour` in [0, 1], 0 where nothing is scored."""
 
     depth: Float[Array, "*b"]  # share of what is seen whose depth agrees
     features: Float[Array, "*b"]  # cosine of the nearest templates' patches, carried into the query
     drawn: Float[Array, "*b"]  # cosine of the object drawn there and described; 1 where it was not drawn
+    colour: Float[Array, "*b"]  # correlation of its colours drawn and seen, in [-1, 1]; 0 where it was not drawn
+    seen: Float[Array, "*b"]  # share of the surface it shows that its reconstruction saw; 1 for scans
     rival: Float[Array, "*b"]  # score of the best pose that differs from this one, as a share of this one's
 
 

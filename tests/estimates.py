@@ -14,7 +14,7 @@ def make_estimate(pose: Similarity, *, success: bool = True, present: bool = Tru
         covariance=jnp.diag(jnp.asarray([4e-4, 1e-4, 1e-4, 1e-6, 1e-6, 4e-6])),
         scale_std=jnp.asarray(0.002),
         ambiguity=jnp.asarray([0.0, 0.0, turn]),
-        agreement=Agreement(*(jnp.asarray(x) for x in (0.9, 0.8, 0.7, 0.6))),
+        agreement=Agreement(*(jnp.asarray(x) for x in (0.9, 0.8, 0.7, 0.5, 1.0, 0.6))),
         hypotheses=Hypotheses(
             Similarity(pose.rotation[None], pose.translation[None], pose.scale[None]), jnp.asarray([0.5])
         ),

@@ -120,13 +120,13 @@ def make_row(turn: int, right: bool, *, surprise: float = 6.0) -> dict:
     quality = 0.9 if right else 0.3
     return {
         "key": ["scan", f"{turn:04d} mug-{turn}", "photo", "scene 0"],
-        "agreement": [quality, quality, quality, 0.2],
+        "agreement": [quality, quality, quality, quality, 1.0, 0.2],
         "add": 0.02 if right else 0.5,
         "surprise": surprise,
         "scale_surprise": 0.5,
         "scale_free": True,
         "independent": 1.0,
-        "absent": {"agreement": [0.2, 0.1, 0.1, 0.9]},
+        "absent": {"agreement": [0.2, 0.1, 0.1, 0.0, 1.0, 0.9]},
     }
 
 
@@ -140,7 +140,7 @@ def test_objects_that_judge_are_not_those_that_fit(tmp_path):
     fit, held = calibration.split(read)
     assert {r["key"][1] for r in fit}.isdisjoint(r["key"][1] for r in held) and len(fit) == len(held) == 4
     features, right, there = calibration.cases(held)
-    assert features.shape == (8, 5) and there.sum() == 4 and not right[~there].any()
+    assert features.shape == (8, 7) and there.sum() == 4 and not right[~there].any()
     text, diagram = calibration.page(held, ConfidenceConfig())
     assert "expected calibration error" in text and sum(count for *_, count in diagram) == 8
     calibration.draw(diagram, tmp_path / "diagram.png")

@@ -15,7 +15,7 @@ from ipjax.config import ConfidenceConfig
 from ipjax.refinement import retract, rotation_from_vector
 from ipjax.types import Agreement, Pairs, Similarity
 
-SURE = Agreement(*(jnp.asarray(x, jnp.float32) for x in (0.95, 0.9, 0.9, 0.1)))
+SURE = Agreement(*(jnp.asarray(x, jnp.float32) for x in (0.95, 0.9, 0.9, 0.8, 1.0, 0.1)))
 CONFIG = ConfidenceConfig()
 
 
@@ -33,17 +33,17 @@ def many(*poses: Similarity) -> Similarity:
 def test_a_better_agreement_is_never_less_probable(weights):
     weights = jnp.asarray(weights)
     sure = float(probability(SURE, weights))
-    for name, worse in (("depth", 0.5), ("features", 0.4), ("drawn", 0.4), ("rival", 0.95)):
+    for name, worse in (("depth", 0.5), ("features", 0.4), ("drawn", 0.4), ("colour", -0.2), ("rival", 0.95)):
         other = dataclasses.replace(SURE, **{name: jnp.asarray(worse, jnp.float32)})
         assert 0 <= float(probability(other, weights)) <= sure <= 1
-    nothing = Agreement(*[jnp.zeros(())] * 4)
+    nothing = jax.tree.map(jnp.zeros_like, SURE)
     assert np.isfinite(float(probability(nothing, weights)))
 
 
 def test_the_present_are_told_from_the_absent():
     """The default threshold separates what agrees in everything from what agrees in nothing."""
     weights = jnp.asarray(CONFIG.drawn)
-    poor = Agreement(*(jnp.asarray(x, jnp.float32) for x in (0.4, 0.2, 0.2, 0.9)))
+    poor = Agreement(*(jnp.asarray(x, jnp.float32) for x in (0.4, 0.2, 0.2, 0.0, 1.0, 0.9)))
     assert float(probability(poor, weights)) < CONFIG.least < float(probability(SURE, weights))
 
 

@@ -85,7 +85,7 @@ def test_the_estimate_says_how_sure_it_is(templates):
     size = float(truth.scale)
     assert np.sqrt(np.diag(spread)[3:]).max() < 0.5 * size and 0 < float(found.scale_std) < 0.5 * size
     assert bool(found.present) == (float(found.confidence) >= TINY.confidence.least)
-    for part in (found.agreement.depth, found.agreement.features, found.agreement.drawn, found.agreement.rival):
+    for part in jax.tree.leaves(found.agreement):
         assert 0 <= float(part) <= 1
     # Half of the object hidden, and what is seen in noise: less is known.
     poor, _ = problems.make_query(1, noise=1.5, occlusion=0.5)

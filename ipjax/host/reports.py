@@ -1,5 +1,6 @@
 """Estimates as JSON: every frame and unit named, and poses told in the user's own mesh coordinates."""
 
+import dataclasses
 import json
 import os
 import tempfile
@@ -154,7 +155,7 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
         "std_deg": float(np.degrees(length)),
     }
     told["agreement"] = {
-        name: float(getattr(estimate.agreement, name)) for name in ("depth", "features", "drawn", "rival")
+        part.name: float(getattr(estimate.agreement, part.name)) for part in dataclasses.fields(estimate.agreement)
     }
     if info.metres_per_unit is not None:
         told["size_from_mesh_mm"] = {"diameter": 1e3 * info.metres_per_unit / info.mesh_scale}
