@@ -118,6 +118,7 @@ def refine(
     def linear(step, _):
         here = lax.stop_gradient(step)
         value, slopes = _linearise(start, here, surface, cloud, config, rigid=rigid)
+        # What the solver differentiates is linear; the added zero has the slopes.
         return value + jnp.sum(slopes * (step - here), axis=1)
 
     def cost(values):  # the prior adds to it but is no residual of the image
@@ -126,7 +127,7 @@ def refine(
     before = cost(_linearise(start, zero, surface, cloud, config, rigid=rigid)[0])
     if not config.steps:
         return start, before
-    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalCholesky())
+    solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
     solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
     after = cost(solution.state.f_info.residual)
     wanted = before * (1 - config.gain) if deformable else before
@@ -333,8 +334,8 @@ def _nearest_visible(targets, placed, visible):
     return lax.platform_dependent(*arguments, cpu=by_points, default=at_once)
 
 
-class NormalCholesky(lx.AbstractLinearSolver):
-    """Least squares through the normal equations and an unrolled Cholesky factorisation.
+class NormalEquations(lx.AbstractLinearSolver):
+    """Least squares through the normal equations.
 
     For a handful of unknowns. Unlike lineax's solvers it lowers to plain arithmetic: no LAPACK or cuSOLVER call, so
     the graph can be exported and vmapped freely.
@@ -354,7 +355,7 @@ class NormalCholesky(lx.AbstractLinearSolver):
         return solve_positive(normal, right), lx.RESULTS.successful, {}
 
     def transpose(self, state: Any, options: dict[str, Any]) -> Any:
-        raise ValueError("NormalCholesky solves least squares only; it has no transpose")
+        raise ValueError("NormalEquations solves least squares only; it has no transpose")
 
     def conj(self, state: Any, options: dict[str, Any]) -> Any:
         return state, options
