@@ -136,12 +136,25 @@ def test_a_reduced_photo_keeps_its_camera_and_depth():
 
 
 def test_a_lens_is_undone():
-    rgb, mask, depth = ball()
-    lens = Intrinsics(K, (-0.3, 0.1, 0.0, 0.0, 0.0), "plumb_bob")
-    shot = photos.take_shot(Photo(rgb), mask=mask, depth=depth, camera=lens)
+    """A photo bent by a barrel lens shows what one without a lens shows, up to rounding."""
+    straight, mask, depth = ball()
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    bent = np.stack([(x - 79.5) / FOCAL, (y - 59.5) / FOCAL])
+    ray = bent
+    for _ in range(50):  # the ray that the lens bends to this pixel
+        squared = np.sum(ray**2, axis=0)
+        ray = bent / (1 - squared + 0.5 * squared**2)
+    column, row = (np.rint(ray[k] * FOCAL + middle).astype(int) for k, middle in enumerate((79.5, 59.5)))
+    seen = lambda image: image[np.clip(row, 0, HEIGHT - 1), np.clip(column, 0, WIDTH - 1)]
+    lens = Intrinsics(K, (-1.0, 0.5, 0.0, 0.0, 0.0), "plumb_bob")
+    shot = photos.take_shot(Photo(seen(straight)), mask=seen(mask), depth=seen(depth), camera=lens)
     assert any("lens" in note for note in shot.foreground.notes)
-    assert not np.array_equal(shot.foreground.rgb, rgb)
-    assert shot.foreground.rgb.shape == rgb.shape and shot.depth.shape == mask.shape
+    middle = np.s_[15:105, 20:140]
+    off = lambda image: np.abs(image.astype(int) - straight.astype(int))[middle].max()
+    assert off(shot.foreground.rgb) <= 3 and off(seen(straight)) > 6
+    both = mask & shot.foreground.mask
+    assert both.sum() > 0.97 * mask.sum() and shot.foreground.mask.sum() < 1.03 * mask.sum()
+    assert np.median(np.abs(shot.depth - depth)[both]) < 1e-3
 
 
 BAD = {

@@ -43,6 +43,7 @@ from ipjax.host.bop import (
     write_results,
 )
 from ipjax.host.meshes import Mesh
+from ipjax.host.progress import bar
 from ipjax.types import Camera, Similarity
 
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
@@ -1239,10 +1240,8 @@ def _check_rows(rows: list[tuple[ResultRow, float]]) -> None:
 def _bar(items: Any, show: bool, unit: str, *, done: int = 0, total: int | None = None) -> Any:
     if not show:
         return items
-    from tqdm import tqdm
-
     items = list(items)
-    return tqdm(items, desc="evaluating", unit=f" {unit}", initial=done, total=total or len(items), smoothing=0.1)
+    return bar(items, desc="evaluating", unit=f" {unit}", initial=done, total=total or len(items), smoothing=0.1)
 
 
 # Small geometry in float64

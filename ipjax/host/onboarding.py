@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8
-from tqdm import tqdm
 
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.features import centre, check_cut, cut, describe, principal_basis
 from ipjax.host.meshes import Mesh, clean, load_mesh, normalise, sample_appearance, sample_surface, sample_texture
 from ipjax.host.objects import ObjectInfo, save
+from ipjax.host.progress import bar
 from ipjax.host.rendering import render
 from ipjax.host.viewpoints import viewpoints
 from ipjax.host.weights import hash_file, load_encoder
@@ -108,7 +108,7 @@ def make_templates(
     with ThreadPoolExecutor(workers) as pool:
         try:
             found = pool.map(see, range(len(poses.scale)))
-            for one, sure in tqdm(found, "describing", len(poses.scale), unit="view", disable=not progress):
+            for one, sure in bar(found, desc="describing", total=len(poses.scale), unit="view", disable=not progress):
                 patches.append(one)
                 seen.append(sure)
         except BaseException:  # Ctrl-C too: what has not begun need not be

