@@ -12,7 +12,8 @@ true pose in the query. A reference without depth has no unit: there, one unit i
 in the reference, and the size is found by the estimate; with depth, the measured size is kept.
 
 In some synthetic scenes the object is also sought behind another object's mask, where it is not; those lines, and what
-each estimate says of its own certainty, are what `benchmarks.calibration` reads.
+each estimate says of its own certainty, are what `benchmarks.calibration` reads. For it, objects made in code can also
+be known from degraded meshes (``--methods level2``, see `ipjax.host.degradation`).
 
 Results are lines of JSON, one per pair and method, written as they come: run again to go on. Templates are fewer than
 by default (24 × 8 instead of 40 × 10) for speed.
@@ -24,17 +25,18 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 METHODS = ("rgb", "rgbd", "scan")
+DEGRADED = ("level1", "level2", "level3", "level4")  # the true mesh made worse, for objects made in code
 BINS = (0, 15, 30, 45, 60, 90, 120, 180.1)  # degrees between the directions from which the two frames see the object
 PER_REFERENCE = 10  # queries of each synthetic reference: onboarding takes most of the time
 ABSENT = 2  # of them in which the object is also sought where another one stands
-SCANS = 3  # of them, for objects made in code, that are also tried with the true mesh: it has no reference
+SCANS = 3  # of them, for objects made in code, that are also tried with the true mesh or a worse copy of it
 POINTS = 4000  # of the model that errors are measured on
 
 
@@ -106,7 +108,7 @@ def ycbv_groups(folder: Path, objects: tuple[int, ...] = (2, 3, 4, 5, 8, 10, 15)
             yield Group(f"obj_{number:06d}", mesh, 1.0, model, shoot(scene, image, truth), queries)
 
 
-def synthetic_groups(pairs: int, data: Path | None, seed: int = 0) -> Iterator[Group]:
+def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = PER_REFERENCE) -> Iterator[Group]:
     """Rendered references (the object alone, lit, on grey) of objects on cluttered tables.
 
     The reference sees the object from an angle drawn evenly from each bin in turn, rolled by up to 20°; both frames
@@ -126,7 +128,7 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0) -> Iterator[G
         dataset = Dataset(data)
         scans = [(f"obj_{n:06d}", normalise(dataset.mesh(n, "models"))) for n in sorted(dataset.models())]
     none = np.eye(3)[None], np.zeros((1, 3))
-    for turn in range(-(-pairs // PER_REFERENCE)):
+    for turn in range(-(-pairs // each)):
         rng = np.random.default_rng([seed, turn])
         made = not (scans and turn % 2)
         if not made:
@@ -137,8 +139,8 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0) -> Iterator[G
         other = make_object(KINDS[(turn + 3) % len(KINDS)], 2000 + turn)
         size, other_size = (float(x) for x in rng.uniform(0.09, 0.22, 2))
         queries = []
-        for k in range(PER_REFERENCE):
-            number = 10_000 * seed + PER_REFERENCE * turn + k
+        for k in range(each):
+            number = 10_000 * seed + each * turn + k
             scene = make_scene([mesh, other], seed=number, sizes=[size, other_size], clutter=2)
             if scene.masks[0].sum() < 400:
                 continue
@@ -182,12 +184,20 @@ def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
 # --- measuring --------------------------------------------------------------------------------------------------------
 
 
-def run(groups: Iterator[Group], output: Path, config, limit: int | None, weights: str | None = None) -> None:
+def run(
+    groups: Iterator[Group],
+    output: Path,
+    config,
+    limit: int | None,
+    weights: str | None = None,
+    methods: Sequence[str] = METHODS,
+) -> None:
     """Try every pair by every method; lines already in ``output`` are not tried again."""
     import jax.numpy as jnp
 
     from benchmarks.measure import commit
     from ipjax.cli import _use_cache
+    from ipjax.host.degradation import degrade
     from ipjax.host.estimation import Estimator
     from ipjax.host.foreground import Photo
     from ipjax.host.onboarding import onboard
@@ -205,10 +215,10 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
     state, tried = commit(), 0
     with output.open("a") as file:
         for group in groups:
-            for method in METHODS:
+            for method in methods:
                 left = len(group.queries) if limit is None else min(limit - tried, len(group.queries))
                 queries = group.queries[: max(left, 0)]
-                if method == "scan":
+                if method not in ("rgb", "rgbd"):
                     queries = queries[: SCANS if group.made else 0]
                 keys = [(method, group.object, group.reference.name, query.name) for query in queries]
                 if all(key in done for key in keys):
@@ -219,15 +229,18 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
                     focal=jnp.asarray([ref.K[0, 0], ref.K[1, 1]], jnp.float32),
                     centre=jnp.asarray([ref.K[0, 2], ref.K[1, 2]], jnp.float32),
                 )
-                made = None
+                made, back = None, None
                 try:
+                    plain = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
                     if method == "scan":
                         if group.object not in scans:
                             unit = group.metres_per_unit
-                            mesh = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
-                            found = onboard(mesh, encoder, config, metres_per_unit=unit, progress=False)
+                            found = onboard(plain, encoder, config, metres_per_unit=unit, progress=False)
                             scans[group.object] = found
                         made = scans[group.object]
+                    elif method in DEGRADED:
+                        worse, back = degrade(plain, int(method[-1]))
+                        made = onboard(worse, encoder, config, progress=False)
                     else:
                         depth = {"depth": ref.depth} if method == "rgbd" else {}
                         photo = onboard_photo(
@@ -253,7 +266,7 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
                     start = time.perf_counter()
                     row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble, "commit": state}
                     if estimator is not None:
-                        row |= judge(group, method, estimator, query)
+                        row |= judge(group, method, estimator, query, back)
                     row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
                     if estimator is not None and query.other is not None:
                         row["absent"] = look_elsewhere(estimator, query)
@@ -266,12 +279,15 @@ def run(groups: Iterator[Group], output: Path, config, limit: int | None, weight
                 return
 
 
-def judge(group: Group, method: str, estimator, query: Shot) -> dict:
-    """The pose found in the query against the truth of both frames; distances in diameters."""
+def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -> dict:
+    """The pose found in the query against the truth of both frames; distances in diameters.
+
+    ``back`` maps a degraded mesh onto the true one.
+    """
     from scipy.spatial import KDTree
 
     from ipjax.host.evaluation import Pose, surface_errors
-    from ipjax.host.reports import Plain, compose, relative_pose
+    from ipjax.host.reports import Plain, compose, invert, relative_pose
 
     info = estimator.objects[0][1]
     try:
@@ -284,8 +300,11 @@ def judge(group: Group, method: str, estimator, query: Shot) -> dict:
         return {"trouble": "no pose found"}
 
     found = estimate.camera_from_object
-    if method == "scan":
-        rotation, translation, scale = compose(found, info.object_from_mesh)
+    if method in ("scan", *DEGRADED):
+        camera_from_mesh = Plain(*compose(found, info.object_from_mesh))
+        if back is not None:
+            camera_from_mesh = compose(camera_from_mesh, invert(Plain(back.rotation, back.translation, back.scale)))
+        rotation, translation, scale = camera_from_mesh
         scale = scale / group.metres_per_unit  # metres per metre of the model
     else:
         ref = group.reference
@@ -356,7 +375,7 @@ def table(rows: list[dict]) -> str:
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     spans = [*itertools.pairwise(BINS), (0, 45), (0, 180.1)]
-    for method in METHODS:
+    for method in (*METHODS, *DEGRADED):
         for low, high in spans:
             chosen = [row for row in rows if row["key"][0] == method and low <= row["angle"] < high]
             if not chosen:
@@ -410,6 +429,17 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--page", type=Path, help="with table: write it here, too, with where it comes from")
     parser.add_argument("--limit", type=int, help="stop after so many pairs")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=list(METHODS),
+        choices=[*METHODS, *DEGRADED],
+        metavar="rgb|rgbd|scan|levelN",
+        help="what the object is known from (default: rgb rgbd scan)",
+    )
+    parser.add_argument(
+        "--queries", type=int, default=PER_REFERENCE, help=f"queries of each synthetic reference ({PER_REFERENCE})"
+    )
     parser.add_argument("--directions", type=int, default=24)
     parser.add_argument("--rolls", type=int, default=8)
     parser.add_argument("--weights", help="of the encoder (default: the best that is here)")
@@ -431,7 +461,7 @@ def main() -> None:
             sys.exit("ycbv needs --data FOLDER")
         groups = ycbv_groups(options.data)
     else:
-        groups = synthetic_groups(options.pairs, options.data, options.seed)
+        groups = synthetic_groups(options.pairs, options.data, options.seed, options.queries)
     start = time.perf_counter()
     run(
         groups,
@@ -439,6 +469,7 @@ def main() -> None:
         OnboardConfig(directions=options.directions, rolls=options.rolls),
         options.limit,
         options.weights,
+        options.methods,
     )
     rows = [json.loads(line) for line in output.read_text().splitlines()]
     print(f"\n{options.directions} × {options.rolls} templates; this run took {time.perf_counter() - start:.0f} s\n")

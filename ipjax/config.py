@@ -56,9 +56,13 @@ class RefineConfig(eqx.Module):
     silhouette_reach: float = 0.1  # silhouettes farther from the border than this are dropped, in diameters
     silhouette_width: float = 0.02  # of the robust loss on the distance between them, in diameters
     silhouette_weight: float = 1.6  # beside 1 for each direction of the depth association
-    deformable: bool = _static(True)  # in the end let the mesh's proportions give way, too
-    strain: float = 0.05  # their standard deviation
-    gain: float = 0.2  # share of the cost that this must save, or the mesh counts as right
+    deformable: bool = _static(True)  # in the end allow for a mesh that is wrong (``refinement.settle``)
+    strain: float = 0.05  # standard deviation of its proportions
+    gain: float = 0.2  # share of the cost that changing them must save, or they count as right
+    forgiveness: float = 4.0  # the width of the losses beside how far the surface is off the depth
+    pairs: int = _static(64)  # best pairs of each view that hold an uneven surface in its place
+    pair_width: float = 0.08  # of the robust loss on their distance, in diameters: about one patch
+    pair_weight: float = 4.0  # of all of them beside 1 for each direction of the depth association
 
 
 class ScoreConfig(eqx.Module):
@@ -68,12 +72,12 @@ class ScoreConfig(eqx.Module):
     resolution: int = _static(56)  # pixels on a side of the depth comparison
     views: int = _static(5)  # templates that lend a hypothesis their features
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
-    power: float = 2.0  # of the feature agreement beside the depth agreement
+    power: float = 2.0  # of the agreement with the templates' features; 1 for that of depth, undrawn, and of drawing
     tolerance: float = 0.05  # depth difference that still agrees, in diameters
     drawn: int = _static(6)  # best candidates drawn and compared again, where the encoder is given; 0 = none
-    depth_power: float = 0.5  # of the depth agreement of a drawn candidate; 1 for that of its features
+    depth_power: float = 0.5  # of the depth agreement of a drawn candidate
     colour_weight: float = 0.5  # logarithm of what the correlation of colours can add to a drawn candidate
-    guess: float = 0.4  # agreement that guessed surface counts as where it is drawn, whatever it looks like
+    guess: float = 0.5  # agreement in features that guessed surface of a drawn candidate counts as, whatever it is
     apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters are drawn once
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 

@@ -15,7 +15,7 @@ from ipjax.confidence import covariance, find_rival, loosest_turn, pair_informat
 from ipjax.config import Config
 from ipjax.features import lift, object_features
 from ipjax.matching import match, select
-from ipjax.refinement import Cloud, information, refine, trace_contour
+from ipjax.refinement import Cloud, information, refine, settle, trace_contour
 from ipjax.scoring import score, seen_share
 from ipjax.types import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
 
@@ -70,7 +70,7 @@ def estimate(
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
     if config.refine.deformable and config.refine.steps:
-        found = _allow_for_a_wrong_mesh(templates, scene, found, config, scale_known=scale_known)
+        found = _settle_best(templates, scene, found, pairs, config, scale_known=scale_known)
     best = jax.tree.map(lambda x: x[0], found)
     # The pairs that speak for it are those of the view that agrees best, whichever view's hypothesis was refined to it.
     offset = jax.vmap(lambda one: best.poses @ one.object - one.camera)(pairs)
@@ -102,13 +102,14 @@ class _Candidates(eqx.Module):
     agreement: Agreement
 
 
-def _allow_for_a_wrong_mesh(
-    templates: Templates, scene: "_Scene", found: _Candidates, config: Config, *, scale_known: bool
+def _settle_best(
+    templates: Templates, scene: "_Scene", found: _Candidates, pairs: Pairs, config: Config, *, scale_known: bool
 ) -> _Candidates:
-    """The same, the first of them refined with a mesh whose proportions may give way."""
-    with jax.named_scope("deform"):
+    """The same, the first of them refined once more, for a mesh that may be wrong; the pairs are those of all views."""
+    held = jax.tree.map(lambda x: x[:, : config.refine.pairs].reshape(-1, *x.shape[2:]), pairs)
+    with jax.named_scope("settle"):
         best = jax.tree.map(lambda x: x[0], found.poses)
-        moved, _ = refine(templates.surface, scene.cloud, best, config.refine, scale_known=scale_known, deformable=True)
+        moved = settle(templates.surface, scene.cloud, best, held, config.refine, scale_known=scale_known)
     poses = jax.tree.map(lambda all_of_them, first: all_of_them.at[0].set(first), found.poses, moved)
     return eqx.tree_at(lambda f: f.poses, found, poses)
 

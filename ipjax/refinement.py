@@ -3,8 +3,11 @@
 Both directions are associated: surface points with the depth they project to, and depth points with their nearest
 surface point. One direction alone lets a free scale shrink or grow the object along the rays. The object's silhouette
 is fitted to the mask's border, which fixes the size that depth leaves loose; surface that projects beside the mask
-costs as much as a point can. Neither counts where something hides the object. A mesh may be wrong: at the end its
-proportions give way where the image insists, so that less is turned or moved to make up for them.
+costs as much as a point can. Neither counts where something hides the object.
+
+A mesh may be wrong. At the end (:func:`settle`) its proportions give way where the image insists, so that less is
+turned or moved to make up for them; or, where its surface is uneven, the fit forgives as much as it is off, and the
+pairs of patches hold what the surface lets slide.
 """
 
 import functools
@@ -23,7 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import project
 from ipjax.config import RefineConfig
-from ipjax.types import Camera, Similarity, Surface
+from ipjax.types import Camera, Pairs, Similarity, Surface
 
 
 class Contour(eqx.Module):
@@ -96,7 +99,6 @@ def refine(
     config: RefineConfig = RefineConfig(),
     *,
     scale_known: bool = False,
-    deformable: bool = False,
 ) -> tuple[Similarity, Float[Array, ""]]:
     """Improve one hypothesis; the caller vmaps.
 
@@ -105,35 +107,113 @@ def refine(
       cloud: the masked depth, and what lies around it.
       camera_from_object: the hypothesis.
       scale_known: leave the scale as it is (SE(3) instead of Sim(3)).
-      deformable: let the proportions of the surface give way. They explain a wrong pose, too, so this is for the last
-        step only, and what comes of it is taken only if the cost falls by ``config.gain``.
 
     Returns:
-      The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1]. For a
-      deformable surface it is the cost in the better proportions, which are not returned.
+      The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1].
     """
-    start, rigid = camera_from_object, 6 if scale_known else 7
-    zero = jnp.zeros(rigid + (5 if deformable else 0), start.translation.dtype)
+    step, before, after = _fit(surface, cloud, camera_from_object, None, config, rigid=6 if scale_known else 7)
+    better = after < before
+    return retract(camera_from_object, jnp.where(better, step, 0)), jnp.where(better, after, before)
+
+
+def settle(
+    surface: Surface,
+    cloud: Cloud,
+    camera_from_object: Similarity,
+    pairs: Pairs,
+    config: RefineConfig = RefineConfig(),
+    *,
+    scale_known: bool = False,
+) -> Similarity:
+    """The last refinement of the chosen hypothesis, for a mesh that may be wrong in either of two ways.
+
+    Its proportions may be wrong: a symmetric strain explains the image. That explains a wrong pose, too, so it is for
+    the last step only, and taken only where the cost falls by ``config.gain``. Or its surface is uneven, by
+    :func:`unevenness`: then the losses are as wide as ``config.forgiveness`` times that, and the more they are widened
+    the more the pairs count, which the shape of the surface does not pull. On an even surface nothing changes.
+
+    Args:
+      surface, cloud, scale_known: as for :func:`refine`.
+      camera_from_object: the hypothesis, refined.
+      pairs: correspondences ``k``, of whatever views; weight 0 = absent. Wrong ones hardly count, the loss is robust.
+    """
+    rigid = 6 if scale_known else 7
+    width = jnp.maximum(config.width, config.forgiveness * unevenness(surface, cloud, camera_from_object, config))
+    wider = width / config.width
+
+    def fit(strain, wider, pair_weight):
+        reach = jnp.maximum(config.reach, 2 * config.width * wider)
+        changed = strain, config.width * wider, reach, config.silhouette_width * wider, pair_weight
+        fields = lambda c: (c.strain, c.width, c.reach, c.silhouette_width, c.pair_weight)
+        allowed = eqx.tree_at(fields, config, changed)
+        step, before, after = _fit(surface, cloud, camera_from_object, pairs, allowed, rigid=rigid, strains=STRAINS)
+        return step[:rigid], before, after
+
+    # One body for both ways, so that it is compiled once: proportions give way, or (all but) nothing does.
+    one = jnp.ones_like(width)
+    ways = jnp.stack([config.strain * one, 1e-3 * config.strain * one]), jnp.stack([one, wider])
+    steps, before, after = jax.vmap(fit)(*ways, jnp.stack([0 * one, config.pair_weight * (1 - wider**-2.0)]))
+    better = after < before
+    strained_enough = after[0] < before[0] * (1 - config.gain)
+    step = jnp.where(strained_enough, steps[0], jnp.where(better[1], steps[1], 0))
+    return retract(camera_from_object, step)
+
+
+STRAINS = 5  # of a symmetric matrix without a trace
+
+
+def unevenness(
+    surface: Surface, cloud: Cloud, camera_from_object: Similarity, config: RefineConfig = RefineConfig()
+) -> Float[Array, ""]:
+    """How far the surface is off the measured depth, in diameters: the standard deviation, from the median.
+
+    Over depth points within ``_UNRELATED`` of visible surface; along its normal.
+    """
+    points, normals = surface.points[: config.points], surface.normals[: config.points]
+    placed, facing, visible = _place(camera_from_object, points, normals)
+    targets = cloud.points.reshape(-1, 3)
+    nearest = _nearest_visible(targets, placed, visible)
+    offset = (placed[nearest] - targets) / camera_from_object.scale
+    near = cloud.valid.reshape(-1) & (jnp.sum(offset * offset, axis=-1) < _UNRELATED**2) & jnp.any(visible)
+    plane = jnp.where(near, jnp.abs(jnp.sum(offset * facing[nearest], axis=-1)), jnp.inf)
+    median = jnp.sort(plane)[jnp.maximum(jnp.sum(near) - 1, 0) // 2]
+    return 1.48 * jnp.where(jnp.any(near), median, 0)
+
+
+_UNRELATED = 0.15  # diameters: what is farther from the surface than this belongs to something else
+
+
+def _fit(
+    surface: Surface,
+    cloud: Cloud,
+    start: Similarity,
+    pairs: Pairs | None,
+    config: RefineConfig,
+    *,
+    rigid: int,
+    strains: int = 0,
+) -> tuple[Float[Array, "n"], Float[Array, ""], Float[Array, ""]]:
+    """The step of least squares from a pose, ``rigid`` coordinates of :func:`retract` and then strains, and the cost
+    before and after it; infinite, and a step of zeros, where it is not finite."""
+    zero = jnp.zeros(rigid + strains, start.translation.dtype)
 
     def linear(step, _):
         here = lax.stop_gradient(step)
-        value, slopes = _linearise(start, here, surface, cloud, config, rigid=rigid)
+        value, slopes = _linearise(start, here, surface, cloud, pairs, config, rigid=rigid)
         # What the solver differentiates is linear; the added zero has the slopes.
         return value + jnp.sum(slopes * (step - here), axis=1)
 
     def cost(values):  # the prior adds to it but is no residual of the image
-        return jnp.sum(values**2) / (values.shape[0] - (zero.shape[0] - rigid))
+        return jnp.sum(values**2) / (values.shape[0] - strains)
 
-    before = cost(_linearise(start, zero, surface, cloud, config, rigid=rigid)[0])
+    before = cost(_linearise(start, zero, surface, cloud, pairs, config, rigid=rigid)[0])
     if not config.steps:
-        return start, before
+        return zero, before, before
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
     solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
     after = cost(solution.state.f_info.residual)
-    wanted = before * (1 - config.gain) if deformable else before
-    better = jnp.isfinite(after) & (after < wanted)
-    step = jnp.where(better, solution.value, zero)
-    return retract(start, step[:rigid]), jnp.where(better, after, before)
+    fine = jnp.isfinite(after)
+    return jnp.where(fine, solution.value, 0), before, jnp.where(fine, after, jnp.inf)
 
 
 @functools.partial(jax.jit, static_argnames="rigid")  # so that it is traced once
@@ -142,6 +222,7 @@ def _linearise(
     step: Float[Array, "n"],
     surface: Surface,
     cloud: Cloud,
+    pairs: Pairs | None,
     config: RefineConfig,
     *,
     rigid: int,
@@ -154,10 +235,14 @@ def _linearise(
 
     def residuals(step):
         moved, strain = retract(start, step[:rigid]), step[rigid:]
-        deformed = strained(surface, strain) if strain.shape[0] else surface
-        values = _residuals(moved, deformed, cloud, config)
+        deformed, matched = surface, pairs
+        if strain.shape[0]:
+            deformed = strained(surface, strain)
+        if strain.shape[0] and matched is not None:
+            matched = eqx.tree_at(lambda p: p.object, matched, matched.object + _stretch(matched.object, strain))
+        values = _residuals(moved, deformed, cloud, matched, config)
         # So that the mean square is in [0, 1].
-        spread = jnp.sqrt(values.shape[0] / (2 + jnp.asarray(config.silhouette_weight, step.dtype)))
+        spread = jnp.sqrt(values.shape[0] / _weight(config, pairs, step.dtype))
         # One standard deviation costs as much as if a hundredth of the surface were lost.
         values = jnp.concatenate([values * spread, strain / config.strain * (0.1 * spread)])
         return values, values
@@ -172,12 +257,22 @@ def strained(surface: Surface, strain: Float[Array, "5"]) -> Surface:
     Args:
       strain: E11, E22, E12, E13, E23, in the object's frame.
     """
+    normals = surface.normals - _stretch(surface.normals, strain)
+    normals = normals / jnp.sqrt(jnp.sum(normals**2, axis=-1, keepdims=True))
+    points = surface.points + _stretch(surface.points, strain)
+    return eqx.tree_at(lambda s: (s.points, s.normals), surface, (points, normals))
+
+
+def _stretch(vectors: Float[Array, "n 3"], strain: Float[Array, "5"]) -> Float[Array, "n 3"]:
     a, b, ab, ac, bc = strain
     matrix = jnp.stack([jnp.stack([a, ab, ac]), jnp.stack([ab, b, bc]), jnp.stack([ac, bc, -a - b])])
-    times = lambda x: jnp.sum(x[:, :, None] * matrix, axis=1)
-    normals = surface.normals - times(surface.normals)
-    normals = normals / jnp.sqrt(jnp.sum(normals**2, axis=-1, keepdims=True))
-    return eqx.tree_at(lambda s: (s.points, s.normals), surface, (surface.points + times(surface.points), normals))
+    return jnp.sum(vectors[:, :, None] * matrix, axis=1)
+
+
+def _weight(config: RefineConfig, pairs: Pairs | None, dtype: Any) -> Float[Array, ""]:
+    """What the squares of all residuals can sum to: 1 for each direction of the depth association, and the rest."""
+    weight = 2 + jnp.asarray(config.silhouette_weight, dtype)
+    return weight if pairs is None else weight + jnp.asarray(config.pair_weight, dtype)
 
 
 def information(
@@ -188,9 +283,9 @@ def information(
     Each kind of residual (surface to depth, depth to surface, silhouette) is averaged: their number does not matter.
     """
     zero = jnp.zeros(7, camera_from_object.translation.dtype)
-    values, slopes = _linearise(camera_from_object, zero, surface, cloud, config, rigid=7)
+    values, slopes = _linearise(camera_from_object, zero, surface, cloud, None, config, rigid=7)
     # Its terms add up to the mean square, here to the sum.
-    share = (2 + jnp.asarray(config.silhouette_weight, zero.dtype)) / values.shape[0]
+    share = _weight(config, None, zero.dtype) / values.shape[0]
     return jnp.sum(slopes[:, :, None] * slopes[:, None, :], axis=0) * share, jnp.sum(values**2) * share
 
 
@@ -217,21 +312,36 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=vector.dtype) * (1 - cosine * squared) + sine * cross + cosine * outer
 
 
-def _residuals(moved, surface, cloud, config):
+def _residuals(moved, surface, cloud, pairs, config):
     """All terms; the squares of each kind sum to at most its weight."""
     points, normals = surface.points[: config.points], surface.normals[: config.points]
     trust = 0.25 + 0.75 * surface.seen[: config.points]
     weight = jnp.asarray(config.silhouette_weight, moved.translation.dtype)
     silhouette = _silhouette(moved, surface.points, cloud, config) * jnp.sqrt(weight)
-    return jnp.concatenate([*_depth_terms(moved, points, normals, trust, cloud, config), silhouette])
+    terms = [*_depth_terms(moved, points, normals, trust, cloud, config), silhouette]
+    if pairs is not None:
+        terms.append(_pair_terms(moved, pairs, config))
+    return jnp.concatenate(terms)
+
+
+def _pair_terms(moved, pairs, config):
+    """Geman–McClure on the distance between the two points of each pair; the squares sum to at most the weight."""
+    squared = jnp.sum((moved @ pairs.object - pairs.camera) ** 2, axis=-1) / (config.pair_width * moved.scale) ** 2
+    share = pairs.weight * jnp.asarray(config.pair_weight, squared.dtype) / jnp.maximum(jnp.sum(pairs.weight), 1e-9)
+    return jnp.sqrt(squared / (1 + squared) + 1e-12) * jnp.sqrt(share)
+
+
+def _place(moved, points, normals):
+    """Points and normals in the camera frame, and which of them show it their front."""
+    placed = moved @ points
+    facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
+    distance = jnp.linalg.norm(placed, axis=-1)
+    return placed, facing, lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * distance)
 
 
 def _depth_terms(moved, points, normals, trust, cloud, config):
     """Surface to depth and depth to surface; the squares of each sum to at most 1."""
-    placed = moved @ points
-    facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
-    distance = jnp.linalg.norm(placed, axis=-1)
-    visible = lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * distance)
+    placed, facing, visible = _place(moved, points, normals)
     column, row, inside = _cells(placed, cloud)
     measured = cloud.valid[row, column] & inside
     forward = _robust(placed - cloud.points[row, column], facing, measured, moved.scale, config)

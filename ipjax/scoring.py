@@ -49,8 +49,9 @@ def score(
         drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
         # What a guessed surface looks like says little, be it like the photo or unlike it.
         trust = seen_share(templates.surface, camera_from_object)
-        looks = trust * drawn + (1 - trust) * config.guess
-        total = geometry**config.depth_power * features * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
+        known = lambda agreement: trust * agreement + (1 - trust) * config.guess
+        looks = known(features) ** config.power * known(drawn)
+        total = geometry**config.depth_power * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
     later = jnp.zeros_like(geometry)  # what only the chosen one needs
     return total, Agreement(geometry, features, drawn, colour, seen=later, rival=later)
 
