@@ -56,7 +56,7 @@ class RefineConfig(eqx.Module):
     silhouette_reach: float = 0.1  # silhouettes farther from the border than this are dropped, in diameters
     silhouette_width: float = 0.02  # of the robust loss on the distance between them, in diameters
     silhouette_weight: float = 1.6  # beside 1 for each direction of the depth association
-    deformable: bool = _static(True)  # in the end allow for a mesh that is wrong (``refinement.settle``)
+    settle: bool = _static(True)  # in the end allow for a mesh that is wrong (``refinement.settle``)
     strain: float = 0.05  # standard deviation of its proportions
     gain: float = 0.2  # share of the cost that changing them must save, or they count as right
     forgiveness: float = 4.0  # the width of the losses beside how far the surface is off the depth
@@ -107,7 +107,7 @@ class Config(eqx.Module):
         """Fewer hypotheses, none tried turned, three drawn, the mesh trusted: less sure which way round things are."""
         return Config(
             match=MatchConfig(views=6),
-            refine=RefineConfig(steps=8, deformable=False),
+            refine=RefineConfig(steps=8, settle=False),
             score=ScoreConfig(alternates=0, drawn=3),
         )
 

@@ -69,7 +69,7 @@ def estimate(
             found = _draw_best(encoder, templates, query, scene, found, config)
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
-    if config.refine.deformable and config.refine.steps:
+    if config.refine.settle and config.refine.steps:
         found = _settle_best(templates, scene, found, pairs, config, scale_known=scale_known)
     best = jax.tree.map(lambda x: x[0], found)
     # The pairs that speak for it are those of the view that agrees best, whichever view's hypothesis was refined to it.
