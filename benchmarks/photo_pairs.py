@@ -287,7 +287,7 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
     from scipy.spatial import KDTree
 
     from ipjax.host.evaluation import Pose, surface_errors
-    from ipjax.host.reports import Plain, compose, invert, relative_pose
+    from ipjax.host.reports import Plain, compose, relative_pose
 
     info = estimator.objects[0][1]
     try:
@@ -301,10 +301,7 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
 
     found = estimate.camera_from_object
     if method in ("scan", *DEGRADED):
-        camera_from_mesh = Plain(*compose(found, info.object_from_mesh))
-        if back is not None:
-            camera_from_mesh = compose(camera_from_mesh, invert(Plain(back.rotation, back.translation, back.scale)))
-        rotation, translation, scale = camera_from_mesh
+        rotation, translation, scale = camera_from_true_mesh(found, info, back)
         scale = scale / group.metres_per_unit  # metres per metre of the model
     else:
         ref = group.reference
@@ -337,6 +334,16 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
         "scale_free": info.measured_diameter is None,
         "scale_surprise": float((scale - 1) * found.scale / scale / max(float(estimate.scale_std), 1e-9)),
     }
+
+
+def camera_from_true_mesh(camera_from_object, info, back: Any = None) -> tuple[np.ndarray, np.ndarray, float]:
+    """An estimate as the pose of the mesh that was onboarded, or of the one that this is a degraded copy of."""
+    from ipjax.host.reports import Plain, compose, invert
+
+    camera_from_mesh = compose(camera_from_object, info.object_from_mesh)
+    if back is None:
+        return camera_from_mesh
+    return compose(Plain(*camera_from_mesh), invert(Plain(back.rotation, back.translation, back.scale)))
 
 
 def certainty(estimate) -> dict:

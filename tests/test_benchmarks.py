@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,9 +12,13 @@ import pytest
 
 from benchmarks import ablation, calibration, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
+from benchmarks.photo_pairs import camera_from_true_mesh
 from ipjax.confidence import probability
 from ipjax.config import ConfidenceConfig, Config
+from ipjax.host.degradation import degrade
+from ipjax.host.reports import Plain, compose, invert
 from ipjax.host.studies import describe_config, read_config
+from ipjax.host.synthetic import make_object
 from ipjax.types import Agreement
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -102,6 +107,8 @@ def test_a_calibration_finds_the_odds_that_made_the_data():
     right = rng.random(4000) < chance
     found = calibration.fit_logistic(features, right)
     np.testing.assert_allclose(found, true, atol=0.2)
+    held = calibration.fit_logistic(features, right, signs=(0, 1, 1, 1, 1))
+    assert held[2] == 0 and np.all(held[1:] >= 0)
     error, rows = calibration.reliability(calibration.chances(features, found), right)
     assert error < 0.03 and sum(count for _, _, count in rows) == 4000
     assert calibration.reliability(np.full(100, 0.9), np.arange(100) < 50)[0] == pytest.approx(0.4)
@@ -114,6 +121,23 @@ def test_chances_are_the_probabilities_of_the_estimate():
     agreement = Agreement(*(jnp.asarray(x, jnp.float32) for x in row["agreement"]))
     expected = float(probability(agreement, jnp.asarray(weights)))
     assert calibration.chances(features, weights)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_shrinkage_is_chosen_on_objects_left_out():
+    rows = [make_row(turn, turn % 3 > 0) for turn in range(6)]
+    assert calibration.choose_ridge(rows) in calibration.RIDGES
+
+
+def test_an_estimate_of_a_degraded_mesh_is_one_of_the_true_mesh():
+    mesh = make_object("mug")
+    _, back = degrade(mesh, 3)
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    truth = Plain(turn * np.sign(np.linalg.det(turn)), np.array([0.1, -0.2, 0.9]), 0.2)
+    camera_from_worse = Plain(*compose(truth, Plain(back.rotation, back.translation, back.scale)))
+    info = SimpleNamespace(object_from_mesh=Plain(np.eye(3), np.array([0.1, 0.0, 0.3]), 2.0))
+    camera_from_object = Plain(*compose(camera_from_worse, invert(info.object_from_mesh)))
+    for found, true in zip(camera_from_true_mesh(camera_from_object, info, back), truth, strict=True):
+        np.testing.assert_allclose(found, true, atol=1e-9)
 
 
 def make_row(turn: int, right: bool, *, surprise: float = 6.0) -> dict:
