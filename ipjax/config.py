@@ -85,11 +85,11 @@ class ScoreConfig(eqx.Module):
 class ConfidenceConfig(eqx.Module):
     """From agreement to a probability and a covariance; most of it fitted by ``python -m benchmarks.calibration``."""
 
-    drawn: tuple[float, ...] = (8.31, 0.95, 1.45, 6.74, 0.0, 0.0, -5.38)  # see ``confidence.probability``
-    undrawn: tuple[float, ...] = (9.59, 1.53, 6.61, 0.0, 0.0, 0.0, -6.84)  # where no candidate was drawn
+    drawn: tuple[float, ...] = (2.04, 0.94, 1.15, 2.37, 5.92, 0.0, -2.04)  # see ``confidence.probability``
+    undrawn: tuple[float, ...] = (7.84, 1.51, 6.84, 0.0, 0.0, 1.23, -3.77)  # where no candidate was drawn
     least: float = 0.5  # confidence below which the object is not here, or not seen well enough
-    independent: float = 10.3  # independent residuals of refinement
-    pair_share: float = 0.025  # of the pairs that are independent
+    independent: float = 9.84  # independent residuals of refinement
+    pair_share: float = 0.0239  # of the pairs that are independent
     tie: float = 0.05  # how fast an alternative's weight falls with the share by which its score is lower; not fitted
 
 
