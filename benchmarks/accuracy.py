@@ -30,8 +30,8 @@ def run(dataset: Dataset, known, encoder, config: str, output: Path, *, keep: bo
         dataset,
         list(known),
         finder,
-        output / config,
-        method=f"ipjax-{config}",
+        output / Path(config).stem,
+        method=f"ipjax-{Path(config).stem}",
         settings=finder.settings(),
         alignments=studies.alignments_of(known),
         metrics=("mssd", "mspd", "add", "add_s"),
@@ -105,18 +105,16 @@ def main() -> None:
     )
     configs = ["default", "paper"] if options.config == "both" else [options.config]
     diameters = {obj_id: dataset.models()[obj_id].diameter for obj_id in known}
-    runs = {
-        name: run(dataset, known, encoder, name, options.output / options.data.name, keep=bool(meshes))
-        for name in configs
-    }
+    output = options.output / options.data.name
+    runs = {Path(c).stem: run(dataset, known, encoder, c, output, keep=bool(meshes)) for c in configs}
     heads = ["rot °", "trans mm", "scale %", "ADD-S %d"]
-    print(f"{'scene':>5} {'image':>6} {'object':>6} " + " | ".join(f"{c}: {', '.join(heads)}" for c in configs))
-    by_config = [runs[name][0].instances for name in configs]
+    print(f"{'scene':>5} {'image':>6} {'object':>6} " + " | ".join(f"{c}: {', '.join(heads)}" for c in runs))
+    by_config = [score.instances for score, _ in runs.values()]
     for instances in zip(*by_config, strict=True):
         one = instances[0]
         told = " | ".join(" ".join(f"{c:>8}" for c in cells(i, diameters[i.obj_id])) for i in instances)
         print(f"{one.scene_id:>5} {one.im_id:>6} {one.obj_id:>6} {told}")
-    figures = {name: summary(runs[name][0], diameters) for name in configs}
+    figures = {name: summary(score, diameters) for name, (score, _) in runs.items()}
     for name, entry in figures.items():
         print(
             f"{name}: medians over {entry['targets']} targets: rotation {entry['rotation_deg']:.1f}°, translation "
@@ -126,8 +124,8 @@ def main() -> None:
         )
         for note in runs[name][0].notes:
             print(f"  note: {note}")
-    for name in configs if meshes else []:
-        tell_reconstruction(dataset, *runs[name], name, options.output / options.data.name)
+    for name in runs if meshes else []:
+        tell_reconstruction(dataset, *runs[name], name, output)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         record = {**describe_device(), "encoder": encoder.identity, "data": options.data.name, "figures": figures}
