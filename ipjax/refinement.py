@@ -130,7 +130,8 @@ def settle(
     Its proportions may be wrong: a symmetric strain explains the image. That explains a wrong pose, too, so it is for
     the last step only, and taken only where the cost falls by ``config.gain``. Or its surface is uneven, by
     :func:`unevenness`: then the losses are as wide as ``config.forgiveness`` times that, and the more they are widened
-    the more the pairs count, which the shape of the surface does not pull. On an even surface nothing changes.
+    the more the pairs count, which the shape of the surface does not pull. On an even surface of the right proportions
+    it is one more :func:`refine`.
 
     Args:
       surface, cloud, scale_known: as for :func:`refine`.
