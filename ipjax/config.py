@@ -72,7 +72,7 @@ class ScoreConfig(eqx.Module):
     resolution: int = _static(56)  # pixels on a side of the depth comparison
     views: int = _static(5)  # templates that lend a hypothesis their features
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
-    power: float = 2.0  # of the agreement with the templates' features; 1 for that of depth, undrawn, and of drawing
+    power: float = 2.0  # of the agreement with the templates' features; that of the object drawn has 1
     tolerance: float = 0.05  # depth difference that still agrees, in diameters
     drawn: int = _static(6)  # best candidates drawn and compared again, where the encoder is given; 0 = none
     depth_power: float = 0.5  # of the depth agreement of a drawn candidate
