@@ -63,8 +63,10 @@ def import_open3d() -> Any:
     os.environ["OMP_NUM_THREADS"] = "1"
     try:
         import open3d
-    except ImportError:
+    except ModuleNotFoundError:
         raise SystemExit(INSTALL) from None
+    except (ImportError, OSError) as error:  # on a bare system libusb-1.0 and libGL are not there
+        raise SystemExit(f"Open3D is installed but a system library that it needs does not load: {error}") from None
     finally:
         if before is None:
             del os.environ["OMP_NUM_THREADS"]

@@ -146,7 +146,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "--methods", nargs="+", default=["paper", "default", "auto"], metavar="paper|fast|default|classical|FILE"
     )
-    parser.add_argument("--levels", type=int, nargs="+", default=[0], choices=range(5), help="qualities of the meshes")
+    parser.add_argument(
+        "--levels",
+        type=int,
+        nargs="*",
+        default=[0],
+        choices=range(5),
+        help="qualities of the meshes; none: only --reconstruction",
+    )
     parser.add_argument(
         "--reconstruction",
         nargs=4,
@@ -166,6 +173,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     parser.add_argument("--page", type=Path, default=Path("out/accuracy"), help="the page, without .md, .html")
     options = parser.parse_args(arguments)
+    if not options.levels and not options.reconstruction:
+        parser.error("--levels names none and there is no --reconstruction: nothing to evaluate")
     methods = [m for m in options.methods if m != "auto"]
     if "auto" in options.methods and has_open3d():
         methods.append("classical")

@@ -128,7 +128,8 @@ def settle(
     """The last refinement of the chosen hypothesis, for a mesh that may be wrong in either of two ways.
 
     Its proportions may be wrong: a symmetric strain explains the image. That explains a wrong pose, too, so it is for
-    the last step only, and taken only where the cost falls by ``config.gain``. Or its surface is uneven, by
+    the last step only, and taken only where the cost falls by ``config.gain``; its losses keep their width in metres,
+    or a mesh that grows and is flattened would pay with wider ones. Or its surface is uneven, by
     :func:`unevenness`: then the losses are as wide as ``config.forgiveness`` times that, and the more they are widened
     the more the pairs count, which the shape of the surface does not pull. On an even surface of the right proportions
     it is one more :func:`refine`.
@@ -142,18 +143,20 @@ def settle(
     width = jnp.maximum(config.width, config.forgiveness * unevenness(surface, cloud, camera_from_object, config))
     wider = width / config.width
 
-    def fit(strain, wider, pair_weight):
+    def fit(strain, wider, pair_weight, fixed):
         reach = jnp.maximum(config.reach, 2 * config.width * wider)
         changed = strain, config.width * wider, reach, config.silhouette_width * wider, pair_weight
         fields = lambda c: (c.strain, c.width, c.reach, c.silhouette_width, c.pair_weight)
         allowed = eqx.tree_at(fields, config, changed)
-        step, before, after = _fit(surface, cloud, camera_from_object, pairs, allowed, rigid=rigid, strains=STRAINS)
+        count = {"rigid": rigid, "strains": STRAINS}
+        step, before, after = _fit(surface, cloud, camera_from_object, pairs, allowed, fixed=fixed, **count)
         return step[:rigid], before, after
 
     # One body for both ways, so that it is compiled once: proportions give way, or (all but) nothing does.
     one = jnp.ones_like(width)
     ways = jnp.stack([config.strain * one, 1e-3 * config.strain * one]), jnp.stack([one, wider])
-    steps, before, after = jax.vmap(fit)(*ways, jnp.stack([0 * one, config.pair_weight * (1 - wider**-2.0)]))
+    held = jnp.stack([0 * one, config.pair_weight * (1 - wider**-2.0)])
+    steps, before, after = jax.vmap(fit)(*ways, held, jnp.array([True, False]))
     better = after < before
     strained_enough = after[0] < before[0] * (1 - config.gain)
     step = jnp.where(strained_enough, steps[0], jnp.where(better[1], steps[1], 0))
@@ -193,21 +196,25 @@ def _fit(
     *,
     rigid: int,
     strains: int = 0,
+    fixed: Bool[Array, ""] | None = None,
 ) -> tuple[Float[Array, "n"], Float[Array, ""], Float[Array, ""]]:
     """The step of least squares from a pose, ``rigid`` coordinates of :func:`retract` and then strains, and the cost
-    before and after it; infinite, and a step of zeros, where it is not finite."""
+    before and after it; infinite, and a step of zeros, where it is not finite.
+
+    Widths are in diameters of the pose in hand, or, where ``fixed``, in those of the start.
+    """
     zero = jnp.zeros(rigid + strains, start.translation.dtype)
 
     def linear(step, _):
         here = lax.stop_gradient(step)
-        value, slopes = _linearise(start, here, surface, cloud, pairs, config, rigid=rigid)
+        value, slopes = _linearise(start, here, surface, cloud, pairs, config, fixed, rigid=rigid)
         # What the solver differentiates is linear; the added zero has the slopes.
         return value + jnp.sum(slopes * (step - here), axis=1)
 
     def cost(values):  # the prior adds to it but is no residual of the image
         return jnp.sum(values**2) / (values.shape[0] - strains)
 
-    before = cost(_linearise(start, zero, surface, cloud, pairs, config, rigid=rigid)[0])
+    before = cost(_linearise(start, zero, surface, cloud, pairs, config, fixed, rigid=rigid)[0])
     if not config.steps:
         return zero, before, before
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
@@ -225,6 +232,7 @@ def _linearise(
     cloud: Cloud,
     pairs: Pairs | None,
     config: RefineConfig,
+    fixed: Bool[Array, ""] | None = None,
     *,
     rigid: int,
 ) -> tuple[Float[Array, "r"], Float[Array, "r n"]]:
@@ -241,7 +249,8 @@ def _linearise(
             deformed = strained(surface, strain)
         if strain.shape[0] and matched is not None:
             matched = eqx.tree_at(lambda p: p.object, matched, matched.object + _stretch(matched.object, strain))
-        values = _residuals(moved, deformed, cloud, matched, config)
+        unit = moved.scale if fixed is None else jnp.where(fixed, start.scale, moved.scale)
+        values = _residuals(moved, unit, deformed, cloud, matched, config)
         # So that the mean square is in [0, 1].
         spread = jnp.sqrt(values.shape[0] / _weight(config, pairs, step.dtype))
         # One standard deviation costs as much as if a hundredth of the surface were lost.
@@ -313,21 +322,21 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return jnp.eye(3, dtype=vector.dtype) * (1 - cosine * squared) + sine * cross + cosine * outer
 
 
-def _residuals(moved, surface, cloud, pairs, config):
-    """All terms; the squares of each kind sum to at most its weight."""
+def _residuals(moved, unit, surface, cloud, pairs, config):
+    """All terms; the squares of each kind sum to at most its weight. ``unit``: the metres that widths count in."""
     points, normals = surface.points[: config.points], surface.normals[: config.points]
     trust = 0.25 + 0.75 * surface.seen[: config.points]
     weight = jnp.asarray(config.silhouette_weight, moved.translation.dtype)
-    silhouette = _silhouette(moved, surface.points, cloud, config) * jnp.sqrt(weight)
-    terms = [*_depth_terms(moved, points, normals, trust, cloud, config), silhouette]
+    silhouette = _silhouette(moved, unit, surface.points, cloud, config) * jnp.sqrt(weight)
+    terms = [*_depth_terms(moved, unit, points, normals, trust, cloud, config), silhouette]
     if pairs is not None:
-        terms.append(_pair_terms(moved, pairs, config))
+        terms.append(_pair_terms(moved, unit, pairs, config))
     return jnp.concatenate(terms)
 
 
-def _pair_terms(moved, pairs, config):
+def _pair_terms(moved, unit, pairs, config):
     """Geman–McClure on the distance between the two points of each pair; the squares sum to at most the weight."""
-    squared = jnp.sum((moved @ pairs.object - pairs.camera) ** 2, axis=-1) / (config.pair_width * moved.scale) ** 2
+    squared = jnp.sum((moved @ pairs.object - pairs.camera) ** 2, axis=-1) / (config.pair_width * unit) ** 2
     share = pairs.weight * jnp.asarray(config.pair_weight, squared.dtype) / jnp.maximum(jnp.sum(pairs.weight), 1e-9)
     return jnp.sqrt(squared / (1 + squared) + 1e-12) * jnp.sqrt(share)
 
@@ -340,23 +349,23 @@ def _place(moved, points, normals):
     return placed, facing, lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * distance)
 
 
-def _depth_terms(moved, points, normals, trust, cloud, config):
+def _depth_terms(moved, unit, points, normals, trust, cloud, config):
     """Surface to depth and depth to surface; the squares of each sum to at most 1."""
     placed, facing, visible = _place(moved, points, normals)
     column, row, inside = _cells(placed, cloud)
     measured = cloud.valid[row, column] & inside
-    forward = _robust(placed - cloud.points[row, column], facing, measured, moved.scale, config)
+    forward = _robust(placed - cloud.points[row, column], facing, measured, unit, config)
     forward = forward * jnp.sqrt(trust)
     on_mask = cloud.mask[row, column] & inside
     # Surface that faces away, lies behind an occluder, or falls into a hole of the depth image cannot have been
     # measured and costs nothing.
-    nearer = (cloud.depth[row, column] > 0) & (cloud.depth[row, column] < placed[:, 2] - config.reach * moved.scale / 2)
+    nearer = (cloud.depth[row, column] > 0) & (cloud.depth[row, column] < placed[:, 2] - config.reach * unit / 2)
     counted = visible & ~lax.stop_gradient(jnp.where(on_mask, ~measured, nearer))
     forward = jnp.where(counted, forward, 0)
     targets = cloud.points[::2, ::2].reshape(-1, 3)
     known = cloud.valid[::2, ::2].reshape(-1)
     nearest = lax.stop_gradient(_nearest_visible(targets, placed, visible))
-    backward = _robust(placed[nearest] - targets, facing[nearest], known, moved.scale, config)
+    backward = _robust(placed[nearest] - targets, facing[nearest], known, unit, config)
     backward = jnp.where(known, backward * jnp.sqrt(trust[nearest]), 0)
     # Hiding most of itself must not pay.
     count = jnp.maximum(jnp.sum(counted), jnp.sum(visible) // 3)
@@ -367,7 +376,7 @@ def _averaged(values, count):
     return values * jnp.sqrt(1 / jnp.maximum(count, 1)).astype(values.dtype)
 
 
-def _silhouette(moved, points, cloud, config):
+def _silhouette(moved, unit, points, cloud, config):
     """Geman–McClure on how far the object's silhouette is from the mask's border, along the border's normal.
 
     The silhouette there is the surface point that reaches farthest out in a strip across the border, so that no mesh
@@ -379,12 +388,12 @@ def _silhouette(moved, points, cloud, config):
     normal = contour.outward[:, None]
     along = jnp.sum(offset * normal, axis=-1)
     across = offset[..., 0] * normal[..., 1] - offset[..., 1] * normal[..., 0]
-    reach = lax.stop_gradient(config.silhouette_reach * moved.scale * focal / jnp.maximum(moved.translation[2], 1e-6))
+    reach = lax.stop_gradient(config.silhouette_reach * unit * focal / jnp.maximum(moved.translation[2], 1e-6))
     strip = (jnp.abs(across) < 1) & (jnp.abs(along) < reach)
     farthest = lax.argmax(jnp.where(strip, along, -jnp.inf), 1, jnp.int32)
     placed = moved @ points[farthest]
     gap = jnp.sum((project(camera, placed) - contour.points) * contour.outward, axis=-1)
-    squared = (gap * placed[:, 2] / focal / (config.silhouette_width * moved.scale)) ** 2
+    squared = (gap * placed[:, 2] / focal / (config.silhouette_width * unit)) ** 2
     cost = jnp.where(jnp.any(strip, axis=1), jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
     return _averaged(jnp.where(contour.valid, cost, 0), jnp.sum(contour.valid))
 
@@ -397,13 +406,13 @@ def _cells(placed, cloud):
     return jnp.clip(pixel[:, 0], 0, width - 1), jnp.clip(pixel[:, 1], 0, height - 1), inside
 
 
-def _robust(offset, normal, ok, scale, config):
+def _robust(offset, normal, ok, unit, config):
     """Geman–McClure on the point-to-plane distance; unmatched points cost the maximum, 1, so that losing a match
     never pays."""
     plane = jnp.sum(offset * normal, axis=-1)
     tangent = jnp.sum(offset * offset, axis=-1) - plane**2
-    squared = (plane**2 + 0.05 * jnp.maximum(tangent, 0)) / (config.width * scale) ** 2
-    near = lax.stop_gradient(ok & (jnp.sum(offset * offset, axis=-1) < (config.reach * scale) ** 2))
+    squared = (plane**2 + 0.05 * jnp.maximum(tangent, 0)) / (config.width * unit) ** 2
+    near = lax.stop_gradient(ok & (jnp.sum(offset * offset, axis=-1) < (config.reach * unit) ** 2))
     return jnp.where(near, jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
 
 

@@ -14,6 +14,7 @@ from ipjax.config import RefineConfig
 from ipjax.features import lift
 from ipjax.refinement import (
     Cloud,
+    _linearise,
     _nearest_visible,
     refine,
     retract,
@@ -114,6 +115,20 @@ def test_wrong_proportions_give_way(scene):
         trusted.append(off(rigid))
         doubted.append(off(run_settle(wrong, cloud, rigid, NO_PAIRS, CONFIG)))
     assert np.median(doubted) < 0.6 * np.median(trusted)
+
+
+def test_widths_fixed_in_metres_do_not_reward_growth(scene):
+    """A mesh that has grown by a tenth and fits badly costs more where its growth does not widen the losses."""
+    surface, cloud, truth = scene
+    grown = jnp.array([0, 0, 0, 0, 0, 0, 0.1], jnp.float32)
+    bumpy = uneven(surface, 0, 0.03)
+    fixed, relative = (
+        np.asarray(_linearise(truth, grown, bumpy, cloud, None, CONFIG, jnp.array(held), rigid=7)[0])
+        for held in (True, False)
+    )
+    assert np.sum(fixed**2) > 1.02 * np.sum(relative**2)
+    there = [_linearise(truth, 0 * grown, bumpy, cloud, None, CONFIG, jnp.array(h), rigid=7)[0] for h in (True, False)]
+    np.testing.assert_array_equal(*there)  # at the start both are the same
 
 
 def test_what_is_right_is_left_alone(scene):
