@@ -2,7 +2,7 @@
 
 From the paper's recipe to `Config()`, one step added after the other, on scans and on degraded meshes (``--levels``) or
 on a reconstructed one (``--reconstruction``). Settings of each step are written as JSON beside the results, so a step
-can be run alone: ``ipjax evaluate DATA --config FILE``. Killed and called again it goes on. Ends with one table.
+can be run alone: ``ipjax evaluate DATA --config FILE``. Killed and called again it goes on. Ends with two tables.
 """
 
 import json
@@ -31,7 +31,7 @@ STEPS = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Write the settings, run them all, print the table."""
+    """Write the settings, run them all, print the tables."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if not arguments or "-h" in arguments or "--help" in arguments:
         print(__doc__)
@@ -57,17 +57,16 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def table(studies: list[results_page.Study]) -> str:
-    """A row for each step, a column for each study: AR of all frames and its interval; and the medians of the first."""
-    first = studies[0]
-    head = ["step", *(f"{s.title}: AR" for s in studies), "rotation °", "translation mm", "scale %"]
-    rows = [head]
-    for index, run in enumerate(first.runs):
-        cells = []
-        for study in studies:
-            part = study.runs[index]["all_frames"]
-            cells.append(results_page.percent(part["recalls"].get("ar"), part["intervals"].get("ar")))
-        rows.append([run["method"].removeprefix("ipjax-").replace("_", " "), *cells, *results_page.median_cells(run)])
-    return "\n".join(results_page.markdown_table(rows)) + f"\n\nMedians are those of {first.title}.\n"
+    """Two tables, a row for each step and a column for each study: AR of all frames with its interval, and medians."""
+    shares = [["AR, %", *(s.title for s in studies)]]
+    medians = [["medians: rotation ° / translation mm / scale %", *shares[0][1:]]]
+    for index, run in enumerate(studies[0].runs):
+        step = run["method"].removeprefix("ipjax-").replace("_", " ")
+        all_of = [study.runs[index] for study in studies]
+        frames = [run["all_frames"] for run in all_of]
+        shares.append([step, *(results_page.percent(f["recalls"].get("ar"), f["intervals"].get("ar")) for f in frames)])
+        medians.append([step, *(" / ".join(results_page.median_cells(run)) for run in all_of)])
+    return "\n".join([*results_page.markdown_table(shares), "", *results_page.markdown_table(medians)]) + "\n"
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import pytest
 from benchmarks import ablation, calibration, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from benchmarks.photo_pairs import camera_from_true_mesh
+from benchmarks.results_page import Study
 from ipjax.confidence import probability
 from ipjax.config import ConfidenceConfig, Config
 from ipjax.host.degradation import degrade
@@ -97,6 +98,23 @@ def test_the_ablation_goes_from_the_paper_to_the_default(tmp_path):
         steps.append(read_config(path))
     assert steps[0] == Config.paper() and steps[-1] == Config()
     assert len({str(describe_config(step)) for step in steps}) == len(steps)
+
+
+def test_the_ablation_has_a_row_for_each_step_and_a_column_for_each_study():
+    def run(step, share):
+        part = {"recalls": {"ar": share}, "intervals": {"ar": [share - 0.1, share + 0.1]}}
+        medians = {"rotation_deg": 100 * share, "translation_mm": 2.0, "scale_percent": 3.0}
+        return {"method": f"ipjax-{step}", "all_frames": part, "medians": medians, "notes": []}
+
+    studies = [
+        Study(title, Path(), None, [run("01_paper", share), run("02_more", share + 0.2)])
+        for title, share in (("scans", 0.5), ("worse", 0.25))
+    ]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in ablation.table(studies).splitlines()]
+    assert lines[0][1:] == ["scans", "worse"]
+    assert lines[2] == ["01 paper", "50.0 [40.0, 60.0]", "25.0 [15.0, 35.0]"]
+    assert lines[3] == ["02 more", "70.0 [60.0, 80.0]", "45.0 [35.0, 55.0]"]
+    assert lines[-1] == ["02 more", "70.0 / 2.0 / 3.0", "45.0 / 2.0 / 3.0"]
 
 
 def test_a_calibration_finds_the_odds_that_made_the_data():
