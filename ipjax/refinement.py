@@ -129,7 +129,7 @@ def settle(
 
     Its proportions may be wrong: a symmetric strain explains the image. That explains a wrong pose, too, so it is for
     the last step only, and taken only where the cost falls by ``config.gain``; its losses keep their width in metres,
-    or a mesh that grows and is flattened would pay with wider ones. Or its surface is uneven, by
+    or a mesh whose proportions are free would grow to widen them. Or its surface is uneven, by
     :func:`unevenness`: then the losses are as wide as ``config.forgiveness`` times that, and the more they are widened
     the more the pairs count, which the shape of the surface does not pull. On an even surface of the right proportions
     it is one more :func:`refine`.
@@ -148,8 +148,8 @@ def settle(
         changed = strain, config.width * wider, reach, config.silhouette_width * wider, pair_weight
         fields = lambda c: (c.strain, c.width, c.reach, c.silhouette_width, c.pair_weight)
         allowed = eqx.tree_at(fields, config, changed)
-        count = {"rigid": rigid, "strains": STRAINS}
-        step, before, after = _fit(surface, cloud, camera_from_object, pairs, allowed, fixed=fixed, **count)
+        sizes = {"rigid": rigid, "strains": STRAINS}
+        step, before, after = _fit(surface, cloud, camera_from_object, pairs, allowed, fixed=fixed, **sizes)
         return step[:rigid], before, after
 
     # One body for both ways, so that it is compiled once: proportions give way, or (all but) nothing does.
