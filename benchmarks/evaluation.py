@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import results_page
-from benchmarks.classical import INSTALL, Classical, import_open3d, read_bodies
+from benchmarks.classical import Classical, import_open3d, read_bodies
 from ipjax.cli import _use_cache
 from ipjax.host import studies
 from ipjax.host.bop import Dataset, DatasetError, write_atomically
@@ -27,13 +27,13 @@ DOUBTFUL = {"ycbv": [(3, 138)]}
 QUALITIES = {0: "scans"} | {level: f"meshes degraded to level {level}" for level in range(1, 5)}
 
 
-def has_open3d() -> bool:
-    """Whether the classical baseline can run."""
+def lacks_open3d() -> str:
+    """Why the classical baseline cannot run; empty where it can."""
     try:
         import_open3d()
-    except SystemExit:
-        return False
-    return True
+    except SystemExit as reason:
+        return str(reason)
+    return ""
 
 
 def doubtful(dataset: Dataset) -> list[tuple[int, int]]:
@@ -176,12 +176,13 @@ def main(arguments: list[str] | None = None) -> None:
     if not options.levels and not options.reconstruction:
         parser.error("--levels names none and there is no --reconstruction: nothing to evaluate")
     methods = [m for m in options.methods if m != "auto"]
-    if "auto" in options.methods and has_open3d():
-        methods.append("classical")
+    reason = lacks_open3d() if {"auto", "classical"} & set(options.methods) else ""
+    if reason and "classical" in methods:
+        raise SystemExit(reason)
+    if "auto" in options.methods and reason:
+        print(f"left out: {reason}")
     elif "auto" in options.methods:
-        print(f"left out: {INSTALL}")
-    elif "classical" in methods and not has_open3d():
-        raise SystemExit(INSTALL)
+        methods.append("classical")
     start = time.perf_counter()
     try:
         planned = plan(options)

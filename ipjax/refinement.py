@@ -143,20 +143,25 @@ def settle(
     width = jnp.maximum(config.width, config.forgiveness * unevenness(surface, cloud, camera_from_object, config))
     wider = width / config.width
 
-    def fit(strain, wider, pair_weight, fixed):
+    def fit(strain, wider, pair_weight, fixed_widths):
         reach = jnp.maximum(config.reach, 2 * config.width * wider)
         changed = strain, config.width * wider, reach, config.silhouette_width * wider, pair_weight
         fields = lambda c: (c.strain, c.width, c.reach, c.silhouette_width, c.pair_weight)
         allowed = eqx.tree_at(fields, config, changed)
-        sizes = {"rigid": rigid, "strains": STRAINS}
-        step, before, after = _fit(surface, cloud, camera_from_object, pairs, allowed, fixed=fixed, **sizes)
+        step, before, after = _fit(
+            surface, cloud, camera_from_object, pairs, allowed, rigid=rigid, strains=STRAINS, fixed_widths=fixed_widths
+        )
         return step[:rigid], before, after
 
     # One body for both ways, so that it is compiled once: proportions give way, or (all but) nothing does.
     one = jnp.ones_like(width)
-    ways = jnp.stack([config.strain * one, 1e-3 * config.strain * one]), jnp.stack([one, wider])
-    held = jnp.stack([0 * one, config.pair_weight * (1 - wider**-2.0)])
-    steps, before, after = jax.vmap(fit)(*ways, held, jnp.array([True, False]))
+    ways = (
+        jnp.stack([config.strain * one, 1e-3 * config.strain * one]),
+        jnp.stack([one, wider]),
+        jnp.stack([0 * one, config.pair_weight * (1 - wider**-2.0)]),
+        jnp.array([True, False]),
+    )
+    steps, before, after = jax.vmap(fit)(*ways)
     better = after < before
     strained_enough = after[0] < before[0] * (1 - config.gain)
     step = jnp.where(strained_enough, steps[0], jnp.where(better[1], steps[1], 0))
@@ -196,25 +201,25 @@ def _fit(
     *,
     rigid: int,
     strains: int = 0,
-    fixed: Bool[Array, ""] | None = None,
+    fixed_widths: Bool[Array, ""] | None = None,
 ) -> tuple[Float[Array, "n"], Float[Array, ""], Float[Array, ""]]:
     """The step of least squares from a pose, ``rigid`` coordinates of :func:`retract` and then strains, and the cost
     before and after it; infinite, and a step of zeros, where it is not finite.
 
-    Widths are in diameters of the pose in hand, or, where ``fixed``, in those of the start.
+    The widths of the losses are in diameters of the pose in hand; with ``fixed_widths``, of the start.
     """
     zero = jnp.zeros(rigid + strains, start.translation.dtype)
 
     def linear(step, _):
         here = lax.stop_gradient(step)
-        value, slopes = _linearise(start, here, surface, cloud, pairs, config, fixed, rigid=rigid)
+        value, slopes = _linearise(start, here, surface, cloud, pairs, config, fixed_widths, rigid=rigid)
         # What the solver differentiates is linear; the added zero has the slopes.
         return value + jnp.sum(slopes * (step - here), axis=1)
 
     def cost(values):  # the prior adds to it but is no residual of the image
         return jnp.sum(values**2) / (values.shape[0] - strains)
 
-    before = cost(_linearise(start, zero, surface, cloud, pairs, config, fixed, rigid=rigid)[0])
+    before = cost(_linearise(start, zero, surface, cloud, pairs, config, fixed_widths, rigid=rigid)[0])
     if not config.steps:
         return zero, before, before
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
@@ -232,7 +237,7 @@ def _linearise(
     cloud: Cloud,
     pairs: Pairs | None,
     config: RefineConfig,
-    fixed: Bool[Array, ""] | None = None,
+    fixed_widths: Bool[Array, ""] | None = None,
     *,
     rigid: int,
 ) -> tuple[Float[Array, "r"], Float[Array, "r n"]]:
@@ -249,7 +254,7 @@ def _linearise(
             deformed = strained(surface, strain)
         if strain.shape[0] and matched is not None:
             matched = eqx.tree_at(lambda p: p.object, matched, matched.object + _stretch(matched.object, strain))
-        unit = moved.scale if fixed is None else jnp.where(fixed, start.scale, moved.scale)
+        unit = moved.scale if fixed_widths is None else jnp.where(fixed_widths, start.scale, moved.scale)
         values = _residuals(moved, unit, deformed, cloud, matched, config)
         # So that the mean square is in [0, 1].
         spread = jnp.sqrt(values.shape[0] / _weight(config, pairs, step.dtype))
@@ -323,7 +328,7 @@ def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
 
 
 def _residuals(moved, unit, surface, cloud, pairs, config):
-    """All terms; the squares of each kind sum to at most its weight. ``unit``: the metres that widths count in."""
+    """All terms; the squares of each kind sum to at most its weight. ``unit``: metres in a diameter of widths."""
     points, normals = surface.points[: config.points], surface.normals[: config.points]
     trust = 0.25 + 0.75 * surface.seen[: config.points]
     weight = jnp.asarray(config.silhouette_weight, moved.translation.dtype)

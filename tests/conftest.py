@@ -3,14 +3,14 @@
 import os
 from pathlib import Path
 
+import hypothesis
+import jax
 import pytest
 from jaxtyping import install_import_hook
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")  # for the processes that tests start; jax here has read it already
+jax.config.update("jax_platforms", os.environ["JAX_PLATFORMS"])
 install_import_hook(["ipjax", "ipjax_kernels"], "beartype.beartype")
-
-import hypothesis  # noqa: E402
-import jax  # noqa: E402
 
 _CACHE = Path(__file__).resolve().parent.parent / "build" / "xla-cache"
 jax.config.update("jax_compilation_cache_dir", str(_CACHE))

@@ -1,21 +1,18 @@
 """Runs ``ipjax`` or ``python -m benchmarks.evaluation`` with the stand-in encoder of `problems`; started by tests.
 
 Arguments: seconds that each image takes longer (so that there is time to be killed in), then "ipjax" or "benchmark",
-then the command's own.
+then the command's own. The folder above must be on the path.
 """
 
 import sys
 import time
-from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+import equinox as eqx
+from problems import CoordinateEncoder, make_encoder
 
-import equinox as eqx  # noqa: E402
-from problems import CoordinateEncoder, make_encoder  # noqa: E402
-
-import ipjax.cli  # noqa: E402
-import ipjax.host.weights  # noqa: E402
-from ipjax.host import studies  # noqa: E402
+import ipjax.cli
+from benchmarks import evaluation
+from ipjax.host import studies
 
 
 class Named(CoordinateEncoder):
@@ -27,7 +24,7 @@ class Named(CoordinateEncoder):
 plain = make_encoder()
 encoder = Named(plain.frequencies, plain.phases)
 ipjax.cli._load_encoder = lambda arguments: encoder
-ipjax.host.weights.load_encoder = lambda *_, **__: encoder
+evaluation.load_encoder = lambda *_, **__: encoder
 estimate = studies.Finder.__call__
 
 
@@ -39,7 +36,6 @@ def slowly(finder, frame, targets):
 studies.Finder.__call__ = slowly
 if sys.argv[2] == "ipjax":
     sys.exit(ipjax.cli.main(sys.argv[3:]))
-from benchmarks import evaluation  # noqa: E402
 
 made: list[studies.Finder] = []
 beside = studies.Finder.beside

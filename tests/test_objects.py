@@ -163,10 +163,10 @@ def test_a_failed_save_leaves_nothing_behind(tmp_path):
 def rewrite(path, change=None, drop=None, metadata=None):
     """The file with tensors and description changed, by its own honest writer: hostile, but well-formed."""
     from safetensors import safe_open
-    from safetensors.numpy import save_file
+    from safetensors.numpy import load_file, save_file
 
+    tensors = load_file(path)
     with safe_open(path, framework="numpy") as opened:
-        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
         text = opened.metadata()["ipjax"]
     for name, array in (change or {}).items():
         tensors[name] = array(tensors[name]) if callable(array) else array

@@ -123,8 +123,8 @@ def test_widths_fixed_in_metres_do_not_reward_growth(scene):
     grown = jnp.array([0, 0, 0, 0, 0, 0, 0.1], jnp.float32)
     bumpy = uneven(surface, 0, 0.03)
     fixed, relative = (
-        np.asarray(_linearise(truth, grown, bumpy, cloud, None, CONFIG, jnp.array(held), rigid=7)[0])
-        for held in (True, False)
+        np.asarray(_linearise(truth, grown, bumpy, cloud, None, CONFIG, jnp.array(fixed), rigid=7)[0])
+        for fixed in (True, False)
     )
     assert np.sum(fixed**2) > 1.02 * np.sum(relative**2)
     there = [_linearise(truth, 0 * grown, bumpy, cloud, None, CONFIG, jnp.array(h), rigid=7)[0] for h in (True, False)]
