@@ -174,7 +174,7 @@ def test_a_sensors_own_files(tmp_path):
         (lambda f: (f / "rgb" / "000000.png").unlink(), "000000.png: no such image"),
         (lambda f: (f / "rgb" / "000000.png").write_bytes(b"\x89PNG junk"), "000000.png: "),
         (lambda f: (f / "depth" / "000000.png").unlink(), "no such depth image"),
-        (lambda f: (f / "scene_camera.json").write_text('{\n"0": [}'), "scene_camera.json, line 2: not valid JSON"),
+        (lambda f: (f / "scene_camera.json").write_text('{\n"0": [}'), "scene_camera.json: not valid JSON: line 2"),
         (lambda f: (f / "scene_camera.json").write_text('{"1": {}}'), "there is no image 0"),
         (lambda f: (f / "scene_camera.json").write_text('{"0": {"depth_scale": 1}}'), "cam_K is missing"),
         (lambda f: (f / "scene_camera.json").write_text('{"0": {"cam_K": [1, 2]}}'), "cam_K must be 9 numbers, got 2"),

@@ -402,7 +402,7 @@ def test_settings_from_a_file(tmp_path):
         ('{"align": {"count": true}}', "of another kind"),
         ('{"from": "nowhere"}', "'from' is one of default, fast, paper, not 'nowhere'"),
         ("[1]", "a JSON object"),
-        ("{", "no JSON"),
+        ("{", "not valid JSON"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=re.escape(says)):
@@ -514,7 +514,7 @@ def written(name, text):
         (lambda root, path: path.unlink(), "mine_small-test.csv: .*cannot be read"),
         (lambda root, path: (root / "test/000000/rgb/000001.png").unlink(), "000001.png: no such image"),
         (lambda root, path: (root / "models_eval/obj_000003.ply").unlink(), "obj_000003.ply: no such model"),
-        (written("test/000000/scene_gt.json", '{"0": [\n}'), "scene_gt.json, line 2: not valid JSON"),
+        (written("test/000000/scene_gt.json", '{"0": [\n}'), "scene_gt.json: not valid JSON: line 2"),
         (
             written("test/000000/scene_gt.json", '{"0": [], "1": []}'),
             "1 instances of object 2 in scene 0, image 0, but 0",

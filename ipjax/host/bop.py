@@ -5,7 +5,6 @@ millimetres; everything returned here is in metres, except `ResultRow`, which is
 Everything is read when asked for. What cannot be read raises `DatasetError`: one sentence that names the file.
 """
 
-import json
 import math
 import os
 import re
@@ -18,8 +17,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ipjax.host.images import as_mask, read_camera, read_depth, read_mask, read_rgb
+from ipjax.host.images import BYTES_PER_PIXEL, as_mask, read_camera, read_depth, read_mask, read_rgb
 from ipjax.host.meshes import Mesh, load_mesh, move
+from ipjax.host.storage import check_budget, read_json
 from ipjax.metrics import SYMMETRY_STEP, discretise_symmetries
 
 MM = 1e-3  # metres
@@ -515,13 +515,16 @@ def decode_rle(segmentation: dict) -> np.ndarray:
         counts = segmentation["counts"]
     except (KeyError, TypeError, ValueError):
         raise ValueError("a run-length mask needs size [height, width] and counts") from None
+    # No mask is larger than an image may be.
+    check_budget(BYTES_PER_PIXEL * max(height, 0) * max(width, 0), f"a run-length mask of {width} × {height} pixels")
     runs = np.asarray(_decompress(counts) if isinstance(counts, str | bytes) else counts)
     if runs.ndim != 1 or (runs.size and runs.dtype.kind not in "ui") or (runs < 0).any():
         raise ValueError("the counts of a run-length mask must be whole numbers, not negative")
-    if height < 1 or width < 1 or int(runs.sum()) != height * width:
-        raise ValueError(
-            f"the runs of a mask cover {int(runs.sum())} pixels, its size {height} × {width} needs more or less"
-        )
+    # A single run beyond the mask could make the sum overflow.
+    longest = int(runs.max(initial=0))
+    covered = longest if longest > max(height * width, 0) else int(runs.sum())
+    if height < 1 or width < 1 or covered != height * width:
+        raise ValueError(f"the runs of a mask cover {covered} pixels, its size {height} × {width} needs more or less")
     values = np.arange(len(runs)) % 2 == 1
     return np.repeat(values, runs).reshape(width, height).T
 
@@ -746,15 +749,9 @@ def _checked(read: Any, path: Path) -> Any:
 
 def _read_json(path: Path) -> Any:
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise DatasetError(f"{path}: not a text file") from None
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        raise DatasetError(f"{path}, line {error.lineno}: not valid JSON ({error.msg})") from None
+        return read_json(path)
+    except ValueError as error:
+        raise DatasetError(str(error)) from None
 
 
 def _numbers(entry: dict, key: str, count: int, where: str) -> np.ndarray:

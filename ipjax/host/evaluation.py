@@ -44,6 +44,7 @@ from ipjax.host.bop import (
 )
 from ipjax.host.meshes import Mesh
 from ipjax.host.progress import bar
+from ipjax.host.storage import parse_json, read_json
 from ipjax.types import Camera, Similarity
 
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
@@ -85,7 +86,7 @@ def read_alignment(path: str | Path) -> Alignment:
     """An alignment file: JSON with ``scale``, ``R`` (3 × 3), ``t``; x_model [mm] = scale · R x_mesh + t."""
     path = Path(path)
     try:
-        entry = json.loads(path.read_text(encoding="utf-8"))
+        entry = read_json(path)
         scale, R, t = float(entry["scale"]), np.asarray(entry["R"], np.float64), np.asarray(entry["t"], np.float64)
         R, t = R.reshape(3, 3), t.reshape(3)
     except (OSError, KeyError, TypeError, ValueError) as error:
@@ -1181,7 +1182,7 @@ class Journal:
         differs: list[str] = []
         for number, line in enumerate(lines, start=1):
             try:
-                entry = json.loads(line)
+                entry = parse_json(line)
                 if number == 1:
                     differs = _differences(entry, head)
                 else:

@@ -17,6 +17,8 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from ipjax.types import Camera
 
+BYTES_PER_PIXEL = 12  # of memory while an image is decoded, converted and copied
+
 # Names that ROS and OpenCV give to the lens models that OpenCV can undistort, and the lengths of their coefficients.
 _LENSES = {
     "plumb_bob": (0, 4, 5),

@@ -5,7 +5,6 @@ frame: ``present = scale * (file - centre)``. Axes are never turned: a Y-up file
 """
 
 import dataclasses
-import json
 import math
 import struct
 from pathlib import Path
@@ -15,6 +14,8 @@ from jaxtyping import Float, Int, UInt8
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import ConvexHull, QhullError
+
+from ipjax.host.storage import parse_json
 
 MAX_FACES = 3_000_000
 MAX_BYTES = 2_000_000_000
@@ -268,7 +269,7 @@ def _check_counts(path: Path, kind: str, size: int) -> None:
             else:
                 text = head + file.read()
         try:
-            tree = json.loads(text)
+            tree = parse_json(text)
             counts = [int(item.get("count", 0)) for item in tree.get("accessors", [])]
             lengths = [int(item.get("byteLength", 0)) for item in tree.get("buffers", [])]
         except (ValueError, AttributeError, TypeError):

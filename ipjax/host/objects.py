@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ipjax.host.storage import parse_json
 from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates
 
 FORMAT = 1
@@ -497,9 +498,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 def _parse_header(text: str, path: Path) -> dict[str, Any]:
     try:
-        header = json.loads(text)
-    except (json.JSONDecodeError, RecursionError):
-        raise ValueError(f"{path}: damaged: its description is not JSON") from None
+        header = parse_json(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: damaged: its description is {error}") from None
     version = header.get("format") if isinstance(header, dict) else None
     if not isinstance(version, int):
         raise ValueError(f"{path}: damaged: its description has no format version")

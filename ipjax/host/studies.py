@@ -27,6 +27,7 @@ from ipjax.host.meshes import load_mesh
 from ipjax.host.objects import FORMAT, load, save
 from ipjax.host.onboarding import onboard
 from ipjax.host.reports import compose
+from ipjax.host.storage import read_json
 from ipjax.host.weights import cache_folder, hash_file
 from ipjax.types import Patches, Similarity, View
 
@@ -56,10 +57,7 @@ def read_config(name: str | Path) -> Config:
     path = Path(name)
     if not path.is_file():
         raise ValueError(f"{name}: neither {', '.join(PRESETS)} nor a file of settings")
-    try:
-        entry = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: no JSON ({error})") from None
+    entry = read_json(path, "file of settings")
     if not isinstance(entry, dict):
         raise ValueError(f"{path}: settings are a JSON object, like {{'match': {{'views': 4}}}}")
     start = entry.pop("from", "default")

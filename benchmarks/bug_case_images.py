@@ -1,0 +1,105 @@
+"""``python -m benchmarks.bug_case_images FOLDER``: what is read from each camera, mask and depth file of FOLDER.
+
+FOLDER holds camera/, mask_*/ and depth_endian/, as small files that other people's reports describe. A line per file:
+what was read, what was said beside it, or the sentence of refusal.
+"""
+
+import argparse
+import logging
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from ipjax.host.frames import frame
+from ipjax.host.images import read_camera, read_depth, read_mask, read_rgb
+
+SIZE = (640, 480)  # of the images that the cameras and masks were made for
+K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
+
+
+class _Said(logging.Handler):
+    def __init__(self):
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    folder = parser.parse_args().folder
+    if not (folder / "camera").is_dir():
+        print(f"{folder}: it has no folder camera/", file=sys.stderr)
+        return 2
+    said = _Said()
+    logging.getLogger("ipjax").addHandler(said)
+    for path in sorted((folder / "camera").iterdir()):
+        _row(path, said, _camera)
+    for path in sorted(folder.glob("mask_*/*")):
+        _row(path, said, _mask)
+    for path in sorted(folder.glob("depth_endian/depth*")):
+        _row(path, said, _depth)
+    return 0
+
+
+def _row(path: Path, said: _Said, read) -> None:
+    said.lines.clear()
+    try:
+        told = read(path)
+    except Exception as error:
+        told = f"{'' if isinstance(error, ValueError) else type(error).__name__ + ': '}{error}"
+        told = "refused: " + told.replace(f"{path}: ", "").split("\n")[0]
+    warned = "".join(f"; WARNING {line}" for line in said.lines)
+    print(f"| {path.parent.name}/{path.name} | {told}{warned} |")
+
+
+def _camera(path: Path) -> str:
+    camera = read_camera(path)
+    (fx, _, cx), (_, fy, cy) = camera.matrix[:2]
+    told = f"fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}, size {camera.size}, {camera.lens} {camera.distortion}"
+    width, height = SIZE if camera.size is None else camera.size
+    y, x = np.mgrid[:height, :width]
+    mask = np.hypot(x - width / 2, y - height / 2) < 60
+    frame(np.full((height, width, 3), 0.5), np.full((height, width), 0.9), mask, camera, depth_scale=1.0)
+    return told
+
+
+def _mask(path: Path) -> str:
+    mask = read_mask(path)
+    y, x = np.nonzero(mask)
+    told = f"{mask.sum()} pixels" + (f" of x {x.min()}–{x.max()}, y {y.min()}–{y.max()}" if mask.any() else "")
+    height, width = mask.shape
+    frame(np.full((height, width, 3), 0.5), np.full((height, width), 0.9), mask, K)
+    return told
+
+
+def _depth(path: Path) -> str:
+    """The same frame with each of the depth files: all of them hold the same depth."""
+    depth = read_depth(path)
+    folder = path.parent
+    view = frame(
+        read_rgb(folder / "rgb.png"),
+        depth,
+        read_mask(folder / "mask.png"),
+        read_camera(folder / "camera.txt"),
+        depth_scale=1.0 if depth.dtype.kind == "f" else 1e-3,
+    )
+    known = np.asarray(view.depth)[np.asarray(view.depth) > 0]
+    raw = np.load(path) if path.suffix == ".npy" else depth
+    again = frame(
+        read_rgb(folder / "rgb.png"),
+        raw,
+        read_mask(folder / "mask.png"),
+        read_camera(folder / "camera.txt"),
+        depth_scale=1.0 if depth.dtype.kind == "f" else 1e-3,
+    )
+    farthest = float(np.asarray(again.depth).max())
+    return f"{depth.dtype.str}: crop from {known.min():.3f} to {known.max():.3f} m; the array as NumPy loads it {farthest:.3f} m"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
