@@ -11,6 +11,7 @@ from pathlib import Path
 
 from benchmarks.measure import commit, describe_device
 from benchmarks.table import render
+from ipjax.host.storage import write_text
 
 
 def benchmarks():
@@ -52,8 +53,7 @@ def main():
             print(f"{row['name']}: {row['implementation']}, {row['size']}, {row['dtype']}", flush=True)
     results["seconds"] = round(time.perf_counter() - begin, 1)
     if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+        write_text(options.json, json.dumps(results, indent=1, ensure_ascii=False) + "\n", parents=True)
     print(f"\n{results['seconds']:.0f} s in all\n\n" + render(results))
 
 

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from benchmarks import evaluation, results_page
-from ipjax.host.bop import write_atomically
+from ipjax.host.storage import write_text
 
 BY_DEPTH = {"ranking": "render", "power": 0.0, "alternates": 0, "drawn": 0}  # candidates compared by depth alone
 TRUSTED = {"settle": False}  # the mesh
@@ -48,11 +48,11 @@ def main(arguments: list[str] | None = None) -> None:
     files = []
     for name, changes in STEPS.items():
         files.append(settings / f"{name}.json")
-        write_atomically(files[-1], json.dumps(changes, indent=1) + "\n")
+        write_text(files[-1], json.dumps(changes, indent=1) + "\n", parents=True)
     page = [] if "--page" in arguments else ["--page", str(folder / "page")]
     evaluation.main([*arguments, "-o", str(folder), *page, "--methods", *map(str, files)])
     text = table(results_page.read_studies(folder / "studies.json"))
-    write_atomically(folder / "table.md", text)
+    write_text(folder / "table.md", text, parents=True)
     print(text)
 
 

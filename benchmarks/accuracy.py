@@ -20,6 +20,7 @@ from ipjax.cli import _use_cache
 from ipjax.host import studies
 from ipjax.host.bop import MM, Dataset, read_results
 from ipjax.host.evaluation import Score, evaluate
+from ipjax.host.storage import write_text
 from ipjax.host.weights import load_encoder
 
 
@@ -127,9 +128,8 @@ def main() -> None:
     for name in runs if meshes else []:
         tell_reconstruction(dataset, *runs[name], name, output)
     if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
         record = {**describe_device(), "encoder": encoder.identity, "data": options.data.name, "figures": figures}
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
+        write_text(options.json, json.dumps(record, indent=1) + "\n", parents=True)
 
 
 def tell_reconstruction(dataset: Dataset, found: Score, finder, name: str, output: Path) -> None:

@@ -24,7 +24,7 @@ from scipy import optimize, stats
 from benchmarks.measure import commit
 from benchmarks.photo_pairs import states
 from ipjax.config import ConfidenceConfig
-from ipjax.host.bop import write_atomically
+from ipjax.host.storage import write_text, writing
 from ipjax.types import Agreement
 
 PARTS = len(dataclasses.fields(Agreement))
@@ -148,7 +148,8 @@ def main() -> None:
     print(text)
     if options.page:
         options.page.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(options.page.with_suffix(".md"), text + f"\n![reliability diagram]({options.page.name}.png)\n")
+        diagram = f"\n![reliability diagram]({options.page.name}.png)\n"
+        write_text(options.page.with_suffix(".md"), text + diagram)
         draw(picture, options.page.with_suffix(".png"))
 
 
@@ -206,7 +207,8 @@ def draw(rows: list[tuple[float, float, int]], path: Path) -> None:
     axes.set(xlabel="confidence said", ylabel="share right", xlim=(-0.02, 1.05), ylim=(-0.05, 1.05))
     axes.set_title("held-out synthetic scenes; numbers are cases", fontsize=9)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    with writing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
     plt.close(figure)
 
 

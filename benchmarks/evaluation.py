@@ -17,8 +17,9 @@ from benchmarks import results_page
 from benchmarks.classical import Classical, import_open3d, read_bodies
 from ipjax.cli import _use_cache
 from ipjax.host import studies
-from ipjax.host.bop import Dataset, DatasetError, write_atomically
+from ipjax.host.bop import Dataset, DatasetError
 from ipjax.host.evaluation import Score, evaluate
+from ipjax.host.storage import write_text
 from ipjax.host.weights import load_encoder
 
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s")
@@ -206,7 +207,7 @@ def main(arguments: list[str] | None = None) -> None:
                 }
             )
             study._finder = None  # its templates are large
-        write_atomically(options.output / "studies.json", json.dumps(manifest, indent=1))
+        write_text(options.output / "studies.json", json.dumps(manifest, indent=1), parents=True)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
     results_page.write(results_page.read_studies(options.output / "studies.json"), options.page)

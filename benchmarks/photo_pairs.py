@@ -407,7 +407,7 @@ def states(rows: list[dict]) -> str:
 def write_page(path: Path, text: str, measured: str) -> None:
     """The tables with what they rest on."""
     from benchmarks.measure import describe_device
-    from ipjax.host.bop import write_atomically
+    from ipjax.host.storage import write_text
 
     device = describe_device()
     head = [
@@ -423,7 +423,7 @@ def write_page(path: Path, text: str, measured: str) -> None:
         f"{device['device']}, {device['cores']} cores, jax {device['jax']}, Python {device['python']}, "
         f"commit {measured}.",
     ]
-    write_atomically(path, "\n".join(head) + "\n\n" + text + "\n")
+    write_text(path, "\n".join(head) + "\n\n" + text + "\n", parents=True)
 
 
 def main() -> None:

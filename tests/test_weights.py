@@ -451,6 +451,7 @@ class Server(http.server.ThreadingHTTPServer):
         super().__init__(("127.0.0.1", 0), Handler)
         self.data, self.stop_after, self.ranges, self.error = data, [], True, 0
         self.requests: list[str] = []
+        self.hold: threading.Event | None = None  # where given, the second half waits for it
 
     @property
     def url(self) -> str:
@@ -473,7 +474,12 @@ class Handler(http.server.BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(rest)))
         self.end_headers()
         with contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.wfile.write(rest[: server.stop_after.pop(0)] if server.stop_after else rest)
+            rest = rest[: server.stop_after.pop(0)] if server.stop_after else rest
+            step = len(rest) if server.hold is None else 2**17
+            for begin in range(0, len(rest), max(step, 1)):
+                if server.hold is not None and begin > len(rest) // 2:
+                    server.hold.wait(timeout=100)
+                self.wfile.write(rest[begin : begin + step])
 
     def log_message(self, *_):
         pass

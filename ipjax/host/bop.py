@@ -6,7 +6,6 @@ Everything is read when asked for. What cannot be read raises `DatasetError`: on
 """
 
 import math
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ipjax.host.images import BYTES_PER_PIXEL, as_mask, read_camera, read_depth, read_mask, read_rgb
 from ipjax.host.meshes import Mesh, load_mesh, move
-from ipjax.host.storage import check_budget, read_json
+from ipjax.host.storage import check_budget, read_json, write_text
 from ipjax.metrics import SYMMETRY_STEP, discretise_symmetries
 
 MM = 1e-3  # metres
@@ -710,7 +709,7 @@ def format_row(row: ResultRow) -> str:
 
 def write_results(path: str | Path, rows: Iterable[ResultRow]) -> Path:
     """Write a result file as BOP's toolkit does (no newline at the end), whole or not at all."""
-    return write_atomically(path, "\n".join([HEADER, *map(format_row, rows)]))
+    return write_text(path, "\n".join([HEADER, *map(format_row, rows)]), parents=True)
 
 
 def as_row(scene_id: int, im_id: int, estimate: Estimate, time: float = -1.0) -> ResultRow:
@@ -720,22 +719,6 @@ def as_row(scene_id: int, im_id: int, estimate: Estimate, time: float = -1.0) ->
     return ResultRow(
         scene_id, im_id, estimate.obj_id, float(estimate.score), tuple(rotation), tuple(translation), float(time)
     )
-
-
-def write_atomically(path: str | Path, text: str) -> Path:
-    """Replace a file by new text; whoever reads it sees the old or the new, also after a crash."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
 
 
 def _checked(read: Any, path: Path) -> Any:

@@ -21,6 +21,7 @@ from ipjax.host.estimation import Estimator
 from ipjax.host.meshes import Mesh, sample_surface, save_mesh
 from ipjax.host.objects import SUFFIX, ObjectInfo
 from ipjax.host.onboarding import onboard
+from ipjax.host.storage import write_text
 from ipjax.host.synthetic import Scene, make_object, make_scene
 from ipjax.types import Similarity
 
@@ -101,13 +102,11 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
 
 def write_inputs(folder: Path, scene: Scene, index: int) -> str:
     """Write photo, depth (16 bits, tenths of a millimetre), mask of one object, and camera; returns their options."""
-    import cv2
-
     write_image(folder / "rgb.png", scene.rgb)
-    cv2.imwrite(str(folder / "depth.png"), np.round(scene.depth * 1e4).astype(np.uint16))
-    cv2.imwrite(str(folder / "mask.png"), scene.masks[index].astype(np.uint8) * 255)
+    write_image(folder / "depth.png", np.round(scene.depth * 1e4).astype(np.uint16))
+    write_image(folder / "mask.png", scene.masks[index].astype(np.uint8) * 255)
     camera = {"cam_K": [round(float(x), 4) for x in scene.matrix.ravel()], "depth_scale": 0.1}
-    (folder / "camera.json").write_text(json.dumps(camera) + "\n")
+    write_text(folder / "camera.json", json.dumps(camera) + "\n")
     names = {name: folder / f"{name}.png" for name in ("rgb", "depth", "mask")} | {"camera": folder / "camera.json"}
     return " ".join(f"--{name} {path}" for name, path in names.items())
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 import cv2
 import jax
@@ -13,6 +14,7 @@ from ipjax.config import Config
 from ipjax.host.images import as_intrinsics
 from ipjax.host.objects import ObjectInfo
 from ipjax.host.reports import UNSURE_TURN
+from ipjax.host.storage import writing
 from ipjax.matching import match
 from ipjax.pipeline import comparable
 from ipjax.types import PoseEstimate, Query, Similarity, Templates
@@ -180,32 +182,19 @@ def silhouette(
     return cover.view(bool)
 
 
-def write_image(path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Save RGB as PNG or JPEG by the name's ending; the file appears whole or not at all.
+def write_image(path: str | Path, image: np.ndarray) -> None:
+    """Save RGB or grey (as PNG also of 16 bits) as PNG or JPEG by the name's ending; it appears whole or not at all.
 
     Raises:
         ValueError: the ending is neither.
         OSError: the file cannot be written.
     """
-    import os
-    import tempfile
-    from pathlib import Path
-
     path = Path(path)
     kind = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}.get(path.suffix.lower())
     if kind is None:
         raise ValueError(f"{path}: pictures are written as .png or .jpg")
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            Image.fromarray(image).save(file, kind, **({"quality": 92} if kind == "JPEG" else {}))
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with writing(path) as temporary:
+        Image.fromarray(image).save(temporary, kind, **({"quality": 92} if kind == "JPEG" else {}))
 
 
 def _transform(pose: Similarity, points: np.ndarray) -> np.ndarray:

@@ -39,12 +39,11 @@ from ipjax.host.bop import (
     as_row,
     detected_targets,
     read_results,
-    write_atomically,
     write_results,
 )
 from ipjax.host.meshes import Mesh
 from ipjax.host.progress import bar
-from ipjax.host.storage import parse_json, read_json
+from ipjax.host.storage import locked, parse_json, read_json, write_text
 from ipjax.types import Camera, Similarity
 
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
@@ -353,7 +352,7 @@ class Score:
 
     def write_json(self, path: str | Path) -> Path:
         """The whole score, with every instance, as JSON."""
-        return write_atomically(path, json.dumps(self.to_dict(), indent=1))
+        return write_text(path, json.dumps(self.to_dict(), indent=1), parents=True)
 
     def parts(self) -> dict[str, Summary]:
         """Recalls by title, the headline first."""
@@ -1118,7 +1117,7 @@ def evaluate(
             without=without,
         )
         found_score.write_json(folder / "score.json")
-        write_atomically(folder / "score.txt", found_score.table() + "\n")
+        write_text(folder / "score.txt", found_score.table() + "\n")
     return found_score
 
 
@@ -1219,15 +1218,10 @@ class Journal:
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
     """One run at a time in a folder; the lock goes with the process, however it ends."""
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        yield
-        return
-    with open(folder / ".lock", "w") as file:
+    with contextlib.ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            held.enter_context(locked(folder / ".lock", wait=False))
+        except BlockingIOError:
             raise DatasetError(f"{folder}: another run is writing here") from None
         yield
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ipjax.config import Config
-from ipjax.host.reports import write_text
+from ipjax.host.storage import write_bytes, write_text
 from ipjax.pipeline import estimate
 from ipjax.types import Camera, Patches, Query, Similarity, Surface, Templates, View
 
@@ -116,12 +116,7 @@ def export(
     run = one if batch is None else jax.vmap(one, (None, 0, 0))
     exported = jax_export.export(jax.jit(run), platforms=PLATFORMS)(*arguments)
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        temporary.write_bytes(exported.serialize())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, bytes(exported.serialize()))
     description = {
         "what": "ipjax.estimate as StableHLO: jax.export.deserialize(open(...).read()).call(templates, query, key)",
         "jax": jax.__version__,

@@ -13,6 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageOps, UnidentifiedImageError
 
+from ipjax.host.storage import writing
+
 MAX_SIDE = 2048  # pixels; larger photos are reduced
 MIN_SIDE = 16  # pixels of the object's longer side
 _WORK = 512  # pixels; GrabCut and the background model run at this size
@@ -364,7 +366,8 @@ def draw_attempts(photo: Photo, attempts: list[tuple[str, np.ndarray]], path: st
         label = np.full((24, width, 3), 255, np.uint8)
         cv2.putText(label, name, (4, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         sheet.append(np.concatenate([label, tile]))
-    Image.fromarray(np.concatenate(sheet, axis=1)).save(path)
+    with writing(path) as temporary:
+        Image.fromarray(np.concatenate(sheet, axis=1)).save(temporary)
 
 
 # --- as the model was trained -----------------------------------------------------------------------------------------

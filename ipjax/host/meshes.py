@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import ConvexHull, QhullError
 
-from ipjax.host.storage import parse_json
+from ipjax.host.storage import parse_json, write_bytes, write_text
 
 MAX_FACES = 3_000_000
 MAX_BYTES = 2_000_000_000
@@ -487,23 +487,18 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         image = Image.fromarray(mesh.texture)
         material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
         if kind == ".obj":
-            material = SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
+            material = SimpleMaterial(name=path.stem, image=image, diffuse=[255, 255, 255, 255])
         out.visual = TextureVisuals(uv=mesh.uv, material=material)
     else:
         out.visual = ColorVisuals(out, vertex_colors=mesh.colours)
     if kind == ".obj":
         text, files = export_obj(out, include_normals=True, return_texture=True, mtl_name=path.stem + ".mtl")
         for name, data in files.items():
-            (path.parent / name).write_bytes(data)
-        path.write_text(text)
+            write_bytes(path.parent / name, data)
+        write_text(path, text)
         return
     data = out.export(file_type=kind[1:])
-    temporary = path.with_name(f".{path.name}.part")  # the file appears whole or not at all
-    try:
-        temporary.write_bytes(data if isinstance(data, bytes) else str(data).encode())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, data if isinstance(data, bytes) else str(data).encode())
 
 
 # --- repairing -----------------------------------------------------------------------------------------------------

