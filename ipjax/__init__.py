@@ -1,28 +1,31 @@
-"""ipjax: from one photo of an object and one RGB-D image of a scene to the object's metric 6-D pose, in JAX."""
+"""ipjax: from one photo of an object and one RGB-D image of a scene to the object's metric 6-D pose, in JAX.
+
+``import ipjax`` loads nothing but this file: every name is imported from its module when it is first used.
+"""
 
 import importlib
+import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from ipjax.config import (
-    AlignConfig,
-    ConfidenceConfig,
-    Config,
-    DescribeConfig,
-    MatchConfig,
-    OnboardConfig,
-    RefineConfig,
-    ScoreConfig,
-)
-from ipjax.features import describe, observe
-from ipjax.pipeline import estimate
-from ipjax.types import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
-
 if TYPE_CHECKING:
+    from ipjax.config import (
+        AlignConfig,
+        ConfidenceConfig,
+        Config,
+        DescribeConfig,
+        MatchConfig,
+        OnboardConfig,
+        RefineConfig,
+        ScoreConfig,
+    )
+    from ipjax.features import describe, observe
     from ipjax.host.drawing import draw
     from ipjax.host.frames import frame
     from ipjax.host.objects import compact, load, save
     from ipjax.host.onboarding import onboard
     from ipjax.host.weights import load_encoder
+    from ipjax.pipeline import estimate
+    from ipjax.types import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
 
 __version__ = "0.1.0"
 __all__ = [
@@ -54,23 +57,37 @@ __all__ = [
     "save",
 ]
 
-# What needs OpenCV, MuJoCo or files is imported when it is first used.
-_HOST = {
-    "compact": "objects",
-    "draw": "drawing",
-    "frame": "frames",
-    "load": "objects",
-    "load_encoder": "weights",
-    "onboard": "onboarding",
-    "save": "objects",
+# Where each of them is.
+_HOMES = {
+    "config": (
+        "AlignConfig",
+        "ConfidenceConfig",
+        "Config",
+        "DescribeConfig",
+        "MatchConfig",
+        "OnboardConfig",
+        "RefineConfig",
+        "ScoreConfig",
+    ),
+    "features": ("describe", "observe"),
+    "host.drawing": ("draw",),
+    "host.frames": ("frame",),
+    "host.objects": ("compact", "load", "save"),
+    "host.onboarding": ("onboard",),
+    "host.weights": ("load_encoder",),
+    "pipeline": ("estimate",),
+    "types": ("Camera", "Patches", "PoseEstimate", "Query", "Similarity", "Surface", "Templates", "View"),
 }
+_HOME = {name: f"ipjax.{module}" for module, names in _HOMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOST:
-        return getattr(importlib.import_module(f"ipjax.host.{_HOST[name]}"), name)
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    if not name.startswith("_") and importlib.util.find_spec(f"ipjax.{name}") is not None:
+        return importlib.import_module(f"ipjax.{name}")
     raise AttributeError(f"module 'ipjax' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOST])
+    return sorted({*globals(), *_HOME})

@@ -172,7 +172,7 @@ inflated, or its depth completed. The report shows what was seen and what was gu
     parser.add_argument("--quiet", action="store_true", help="no progress bars, no notes")
     photo = parser.add_argument_group("photos")
     photo.add_argument("--mask", type=Path, metavar="FILE", help="the object (default: transparency, plain background)")
-    photo.add_argument("--box", type=_numbers, metavar="X,Y,W,H", help="cut the object out inside this box, pixels")
+    photo.add_argument("--box", type=_box, metavar="X,Y,W,H", help="cut the object out inside this box, pixels")
     photo.add_argument("--click", type=_numbers, metavar="X,Y", help="cut out the object at this pixel")
     photo.add_argument("--depth", type=Path, metavar="FILE", help="depth aligned to the photo: metric front and size")
     photo.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
@@ -288,7 +288,7 @@ examples:
   ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png -o pose.json
   ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json \\
       --mask mug.png --mask box.png --overlay out.png       several objects: one mask (or box) each, in their order
-  ipjax estimate mug.ipjax --rgb a.png --depth a.npy --camera 600,600,320,240 --box 210 130 90 120
+  ipjax estimate mug.ipjax --rgb a.png --depth a.npy --camera 600,600,320,240 --box 210,130,90,120
   ipjax estimate mug.ipjax --frames scene/ -o poses.json --overlay pictures/
 
 A folder of frames holds rgb/ and depth/ with one file of the same name per frame, mask/ (or masks/, mask_visib/) with
@@ -306,9 +306,7 @@ measured is kept; --size says another, --free-size lets it be found.
     parser.add_argument("--depth", type=Path, metavar="FILE", help="depth aligned to it: 16-bit PNG, TIFF or npy")
     parser.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
     parser.add_argument("--mask", type=Path, metavar="FILE", action="append", help="the object's visible pixels")
-    parser.add_argument(
-        "--box", type=float, nargs=4, metavar=("X", "Y", "W", "H"), action="append", help="instead of a mask, pixels"
-    )
+    parser.add_argument("--box", type=_box, metavar="X,Y,W,H", action="append", help="instead of a mask, pixels")
     parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
     parser.add_argument("--image", type=int, metavar="ID", help="which image of a BOP scene_camera.json")
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
@@ -317,12 +315,7 @@ measured is kept; --size says another, --free-size lets it be found.
     size.add_argument("--diameter", type=float, metavar="METRES", help="the same in metres")
     size.add_argument("--free-size", action="store_true", help="find the size even where the reference photo told it")
     parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
-    parser.add_argument(
-        "--method",
-        choices=("best", "fast", "paper"),
-        default="best",
-        help="settings: the surest, the fastest, or the paper's",
-    )
+    _add_config(parser)
     parser.add_argument("--seed", type=int, default=0, help="same seed, same answer (default 0)")
     parser.add_argument("-o", "--output", type=Path, metavar="JSON", help="where the poses go (default: the screen)")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="a picture of the result (with --frames: a folder)")
@@ -350,7 +343,9 @@ def _estimate(arguments: argparse.Namespace) -> int:
 
     from ipjax.host.frames import frame
     from ipjax.host.objects import load
+    from ipjax.host.studies import read_config
 
+    config = read_config(arguments.config)
     # What is cheap to refuse is refused before weights are loaded and anything is compiled.
     first = _read_frame(frames[0], arguments) if not many else None
     if first is not None:
@@ -371,13 +366,11 @@ def _estimate(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         arguments.notes.tell()
     _use_cache()
-    from ipjax.config import Config
     from ipjax.host.drawing import draw, gather_evidence, write_image
     from ipjax.host.estimation import Estimator
     from ipjax.host.reports import CONVENTIONS, tell_estimate, to_json
     from ipjax.host.storage import write_text
 
-    config = Config.named("default" if arguments.method == "best" else arguments.method)
     estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
     # A reference photo with depth has measured the size; else it is free, unless the user knows it.
     diameters = [
@@ -441,7 +434,12 @@ def _estimate(arguments: argparse.Namespace) -> int:
                 print(_summary(entry["frame"], one))
     if many and failed == len(frames):
         raise ValueError(f"{arguments.frames}: no frame could be used; the first: {told[0]['error']}")
-    head = {"format": "ipjax poses 1", "conventions": CONVENTIONS, "method": arguments.method, "seed": arguments.seed}
+    head = {
+        "format": "ipjax poses 1",
+        "conventions": CONVENTIONS,
+        "config": arguments.config,
+        "seed": arguments.seed,
+    }
     text = to_json(head | {"frames": told})
     if arguments.output is None:
         sys.stdout.write(text)
@@ -759,7 +757,7 @@ state of the code, are not continued; --restart begins anew.
     parser.add_argument("--split", default="test", help="which split (default test)")
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
     parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only these objects")
-    parser.add_argument("--config", default="default", metavar="default|fast|paper|FILE", help="settings; FILE is JSON")
+    _add_config(parser)
     parser.add_argument(
         "--mesh-quality", type=int, default=0, choices=range(5), help="degrade the models first: 1 … 4 (default 0: not)"
     )
@@ -896,17 +894,17 @@ examples:
     )
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True)
     parser.add_argument("--batch", type=_positive, help="queries at once (default: one, without a batch axis)")
-    parser.add_argument("--config", choices=("default", "fast", "paper"), default="default")
+    _add_config(parser)
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from ipjax.config import Config
     from ipjax.host.exporting import blank_query, export
     from ipjax.host.objects import load
+    from ipjax.host.studies import read_config
 
     output = _check_output(arguments.output, (".stablehlo",))
+    config = read_config(arguments.config)
     templates, info = load(arguments.object)
-    config = Config.named(arguments.config)
     export(templates, blank_query(templates, info.resolution), output, config, batch=arguments.batch)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; its inputs and outputs: {output}.json")
     return 0
@@ -927,6 +925,35 @@ def _numbers(text: str) -> tuple[float, ...]:
     if any(value != value or abs(value) == float("inf") for value in values):
         raise ValueError
     return values
+
+
+def _box(text: str) -> tuple[float, ...]:
+    try:
+        values = _numbers(text)
+    except ValueError:
+        values = ()
+    if len(values) != 4:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no box: give four numbers with commas and no spaces, X,Y,W,H, for instance 210,130,90,120"
+        )
+    return values
+
+
+class _Renamed(argparse.Action):
+    """An option of an earlier version: says what it is called now."""
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: Any = None) -> None:
+        parser.error(f"{option} is called --config now: default (which was best), fast, paper, or a file of settings")
+
+
+def _add_config(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--config",
+        default="default",
+        metavar="default|fast|paper|FILE",
+        help="settings: the surest, the fastest, the paper's, or a JSON file of what differs from the default",
+    )
+    parser.add_argument("--method", action=_Renamed, help=argparse.SUPPRESS)
 
 
 _numbers.__name__ = "list of numbers"

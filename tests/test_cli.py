@@ -96,8 +96,8 @@ MALFORMED = {
     "depth scale negative": (None, {}, ("--depth-scale", -1), "positive"),
     "mask empty": (image(np.zeros((96, 128), np.uint8), "mask.png"), {}, (), "the mask is empty"),
     "mask of another size": (image(np.full((40, 50), 255, np.uint8), "mask.png"), {}, (), "but the mask is"),
-    "box outside": (None, {"mask": None}, ("--box", 500, 500, 10, 10), "outside the image"),
-    "box without size": (None, {"mask": None}, ("--box", 5, 5, 0, 10), "positive size"),
+    "box outside": (None, {"mask": None}, ("--box", "500,500,10,10"), "outside the image"),
+    "box without size": (None, {"mask": None}, ("--box", "5,5,0,10"), "positive size"),
     "K singular": (text("camera.json", json.dumps(K | {"fx": 0})), {}, (), "singular"),
     "K not finite": (text("camera.json", json.dumps(K | {"fx": "nan"})), {}, (), "not finite"),
     "camera of another image": (text("camera.json", '{"7": {}, "8": {}}'), {}, (), "say which one"),
@@ -208,15 +208,45 @@ def test_help_teaches_by_examples(name, capfd):
     assert "ipjax" in out and ("example" in out or "start here" in out)
 
 
-def test_help_loads_nothing_heavy():
+COMMANDS = ("onboard", "estimate", "demo", "doctor", "weights", "score", "evaluate", "degrade", "export")
+
+
+@pytest.mark.parametrize(
+    "words", ["--version", "--help", *(f"{name} --help" for name in COMMANDS), "weights fetch --help"]
+)
+def test_help_and_version_load_nothing_but_the_command(words):
+    """A count, for time would depend on the machine: 97 modules where there once were 897."""
     program = (
-        "import sys\nfrom ipjax import cli\n"
-        "try: cli.main(['estimate', '--help'])\nexcept SystemExit: pass\n"
-        "heavy = {'mujoco', 'cv2', 'trimesh', 'torch'} & sys.modules.keys()\n"
-        "sys.exit(f'loaded {heavy}' if heavy else 0)"
+        "import json, sys\nbefore = set(sys.modules)\nfrom ipjax import cli\n"
+        f"try: cli.main({words.split()!r})\nexcept SystemExit as end: assert end.code == 0\n"
+        "print(json.dumps(sorted(set(sys.modules) - before)), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
+    loaded = json.loads(done.stderr.splitlines()[-1])
+    assert {name for name in loaded if name.split(".")[0] == "ipjax"} == {"ipjax", "ipjax.cli"}
+    assert {name.split(".")[0] for name in loaded} <= {"ipjax", *sys.stdlib_module_names}
+    assert len(loaded) < 130
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["estimate", "a.ipjax", "--box", "210", "130", "90", "120"], "with commas and no spaces, X,Y,W,H"),
+        (["estimate", "a.ipjax", "--box", "210,130,90"], "is no box"),
+        (["onboard", "a.png", "-o", "a.ipjax", "--box", "1,2,3,nan"], "is no box"),
+        (["estimate", "a.ipjax", "--method", "best"], "--method is called --config now: default"),
+        (["evaluate", "data", "-o", "out", "--method", "fast"], "--method is called --config now"),
+        (
+            ["export", "a.ipjax", "-o", "a.stablehlo", "--config", "best"],
+            "best: neither default, fast, paper nor a file",
+        ),
+    ],
+)
+def test_one_spelling_and_a_word_for_the_old_one(words, said, capfd):
+    assert run(words) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and said in error, error
 
 
 def test_the_module_runs_and_fails_in_one_line(case):

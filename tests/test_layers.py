@@ -1,12 +1,15 @@
 """Data goes one way: every module imports only from the layers before its own, and importing ipjax costs nothing."""
 
 import ast
+import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+import ipjax
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -109,10 +112,24 @@ def test_imports_only_from_layers_before(module):
     assert find_faults(MODULES[module].read_text(), module, set(MODULES)) == []
 
 
-def test_public_names_come_from_the_pure_layers():
-    for line, name, top in list_imports(MODULES["ipjax"].read_text(), "ipjax", set(MODULES)):
-        if top and name.startswith("ipjax"):
-            assert layer_of(name) < LAYERS["ipjax.host"], f"line {line} imports {name}, which needs heavy packages"
+def test_public_names_are_lazy_and_typed_as_they_are_found():
+    source = MODULES["ipjax"].read_text()
+    top = [name for _, name, top in list_imports(source, "ipjax", set(MODULES)) if top]
+    assert not [name for name in top if name.split(".")[0] not in sys.stdlib_module_names]
+    typed = {
+        alias.name: node.module
+        for block in ast.walk(ast.parse(source))
+        if is_for_types(block)
+        for node in ast.walk(block)
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert typed == ipjax._HOME and sorted(typed) == ipjax.__all__
+    for name, module in typed.items():
+        assert getattr(ipjax, name) is getattr(importlib.import_module(module), name)
+    assert ipjax.matching.match and set(ipjax.__all__) <= set(dir(ipjax))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        ipjax.nothing  # noqa: B018
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if layer_of(name) < LAYERS["ipjax.host"]])
@@ -147,16 +164,21 @@ def test_finds_what_goes_back():
 
 
 def test_import_is_light():
+    """``import ipjax`` loads the standard library at most; the pure names start no backend and load no host module."""
     code = """
 import sys, json
+before = set(sys.modules)
 import ipjax
+first = sorted(set(sys.modules) - before)
+ipjax.Config, ipjax.estimate, ipjax.describe, ipjax.View
 from jax._src import xla_bridge
-print(json.dumps([sorted({name.split('.')[0] for name in sys.modules}), xla_bridge.backends_are_initialized(),
-                  sorted(name for name in sys.modules if name.startswith('ipjax.host.'))]))
+print(json.dumps([first, sorted(sys.modules), xla_bridge.backends_are_initialized()]))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd="/", timeout=120)
     assert done.returncode == 0, done.stderr
-    loaded, started, host = json.loads(done.stdout)
-    assert not {"mujoco", "cv2", "trimesh", "torch", "matplotlib", "onnx", "onnxruntime"} & set(loaded)
+    first, loaded, started = json.loads(done.stdout)
+    assert {name.split(".")[0] for name in first} - set(sys.stdlib_module_names) == {"ipjax"} and "ipjax" in first
+    heavy = {"mujoco", "cv2", "trimesh", "torch", "matplotlib", "onnx", "onnxruntime"}
+    assert not heavy & {name.split(".")[0] for name in loaded}
     assert not started, "importing ipjax started a JAX backend"
-    assert host == []
+    assert not [name for name in loaded if name.startswith("ipjax.host.")]
