@@ -329,7 +329,7 @@ def test_time_that_another_has_spent_is_counted(small, tmp_path):
 def test_results_hang_on_the_code(monkeypatch):
     """Every file whose change can change an estimate is in the hash; none of those that only print or score."""
     code = studies.hash_code()
-    assert re.fullmatch("[0-9a-f]{12}", code) and code == studies.hash_code()
+    assert re.fullmatch("[0-9a-f]{16}", code) and code == studies.hash_code()
     read: list[str] = []
     opened = Path.read_bytes
     monkeypatch.setattr(Path, "read_bytes", lambda self: (read.append(self.name), opened(self))[1])

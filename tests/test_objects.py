@@ -72,8 +72,9 @@ def test_what_was_saved_comes_back(file):
     jax.tree.map(np.testing.assert_array_equal, templates, again)
     assert jax.tree.structure(templates) == jax.tree.structure(again)
     assert again.patches.features.dtype == jnp.float16
+    assert len(told.content_sha256) == 64  # only a file has one
     for field in dataclasses.fields(ObjectInfo):
-        if field.name not in ("vertices", "faces", "colours", "pictures"):
+        if field.name not in ("vertices", "faces", "colours", "pictures", "content_sha256"):
             assert getattr(told, field.name) == getattr(info, field.name), field.name
     np.testing.assert_array_equal(told.vertices, info.vertices)
     np.testing.assert_array_equal(told.faces, info.faces)

@@ -155,6 +155,7 @@ class ObjectInfo:
         vertices, faces, colours: the normalised mesh, for pictures; None = not kept.
         pictures: the template images ``[v h w 3]`` uint8, or the JPEG bytes of each; None = not kept.
         reference: the photo it was made from; None = made from a mesh.
+        content_sha256: of the object file it was read from, as its header says; `check` compares.
     """
 
     name: str
@@ -172,6 +173,7 @@ class ObjectInfo:
     colours: np.ndarray | None = None
     pictures: Any = None
     reference: Reference | None = None
+    content_sha256: str = ""
 
     @property
     def measured_diameter(self) -> float | None:
@@ -518,6 +520,7 @@ def _info(header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path) ->
             notes=tuple(str(note) for note in header.get("notes", ())),
             resolution=int(header["resolution"]),
             reference=_reference(header, tensors),
+            content_sha256=str(header.get("content_sha256", "")),
         )
     except (KeyError, TypeError, ValueError, AttributeError):
         raise ValueError(f"{path}: damaged: its description lacks the mesh, the encoder or the name") from None

@@ -10,9 +10,10 @@ import logging
 import math
 import re
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import equinox as eqx
 
@@ -26,6 +27,7 @@ from ipjax.host.evaluation import Alignment, read_alignment
 from ipjax.host.meshes import load_mesh
 from ipjax.host.objects import FORMAT, load, save
 from ipjax.host.onboarding import onboard
+from ipjax.host.provenance import hash_executed
 from ipjax.host.reports import compose
 from ipjax.host.storage import read_json, write_text
 from ipjax.host.weights import cache_folder, hash_file
@@ -194,32 +196,54 @@ def _kept_alignment(path: Path) -> Alignment | None:
     return dataclasses.replace(read_alignment(path), source=OWN_MAP) if path.is_file() else None
 
 
-def _key(source: Path, encoder: Encoder, config: OnboardConfig, quality: int, seed: int) -> str:
-    """All that an object file hangs on, in sixteen digits."""
-    files = [source, *sorted(p for p in source.parent.glob(f"{source.stem}.*") if p != source and p.is_file())]
+ONBOARDING = ("ipjax.host.onboarding", "ipjax.host._render_child")  # the child runs in a process of its own
+_BESIDE = (".mtl", ".bin", ".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ktx2")
+
+
+def _key(
+    source: Path,
+    encoder: Encoder,
+    config: OnboardConfig,
+    quality: int,
+    seed: int,
+    *,
+    hash_code: Callable[..., str] = hash_executed,
+) -> str:
+    """All that an object file hangs on, the code that makes it included, in sixteen digits."""
     parts = [
         __version__,
         FORMAT,
+        hash_code(*ONBOARDING, *(["ipjax.host.degradation"] if quality else [])),
         encoder.identity,
         describe_config(config),
-        [hash_file(p) for p in files if p.suffix.lower() in (".ply", ".obj", ".glb", ".stl", ".jpg", ".png", ".mtl")],
+        {path.name: hash_file(path) for path in _files_of(source)},
     ]
     if quality:
         parts += [quality, seed]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
 
-def hash_code() -> str:
-    """Twelve digits of the source that an estimate hangs on, so that results of another state are not continued."""
-    import ipjax_kernels
+def _files_of(source: Path) -> list[Path]:
+    """A mesh file and the files beside it that it or its materials name, or that share its name."""
+    around = [p for pattern in ("*", "*/*") for p in source.parent.glob(pattern) if p.suffix.lower() in _BESIDE]
+    found, waiting = {source}, [source]
+    while waiting:
+        path = waiting.pop()
+        text = path.read_bytes() if path.suffix.lower() in (".obj", ".gltf", ".mtl") else b""
+        if path.suffix.lower() == ".ply":
+            with open(path, "rb") as file:
+                text = file.read(2**16)  # its header, where a texture is named
+        for one in around:
+            named = one.name.encode() in text or quote(one.name).encode() in text
+            if one not in found and (named or (one.parent == source.parent and one.stem == source.stem)):
+                found.add(one)
+                waiting.append(one)
+    return sorted(found)
 
-    package, kernels = Path(__file__).parent.parent, Path(ipjax_kernels.__file__).parent
-    files = [p for p in package.glob("*.py") if p.stem not in ("cli", "metrics", "triposr", "__main__")]
-    files += [package / "host" / f"{name}.py" for name in ("estimation", "frames", "studies")]
-    digest = hashlib.sha256()
-    for path in [*sorted(files), *sorted(kernels.glob("*.py"))]:
-        digest.update(path.name.encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
+
+def hash_code() -> str:
+    """Sixteen digits of the source that an estimate hangs on, so that results of another state are not continued."""
+    return hash_executed("ipjax.host.estimation", also=("ipjax.host.studies", "ipjax.host.bop"))
 
 
 class Finder:
@@ -282,7 +306,12 @@ class Finder:
         made = {}
         for obj_id in self.known:
             info = self.estimator.objects[self._index(obj_id)][1]
-            made[str(obj_id)] = {"mesh": info.mesh_sha256, "notes": list(info.notes), **_plain(info.config)}
+            made[str(obj_id)] = {
+                "content": info.content_sha256,
+                "mesh": info.mesh_sha256,
+                "notes": list(info.notes),
+                **_plain(info.config),
+            }
         return {
             "version": __version__,
             "code": hash_code(),
