@@ -84,4 +84,4 @@ def rows(quick: bool):
 def whole(encoder, templates, view, key, config, diameter):
     """What is measured."""
     query = Query(describe(encoder, view), view)
-    return estimate(templates, query, key, config, diameter=diameter, encoder=encoder)
+    return estimate(encoder, templates, query, key, config, diameter)

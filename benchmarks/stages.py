@@ -46,9 +46,9 @@ def rows(quick: bool):
             ("match + select + align, compact templates", fewer): (front, (small, query, key, Config())),
             (f"refine, {poses.scale.shape[0]} hypotheses", fewer): (refine_all, (small, query, poses, Config())),
             (f"score, {poses.scale.shape[0]} hypotheses", fewer): (score_all, (small, query, poses, Config())),
-            ("estimate, Config.paper()", size): (estimate, (templates, query, key, Config.paper())),
-            ("estimate, Config.fast(), compact templates", fewer): (estimate, (small, query, key, Config.fast())),
-            ("estimate, Config(), compact templates", fewer): (estimate, (small, query, key, Config())),
+            ("estimate, Config.paper()", size): (estimate, (None, templates, query, key, Config.paper())),
+            ("estimate, Config.fast(), compact templates", fewer): (estimate, (None, small, query, key, Config.fast())),
+            ("estimate, Config(), compact templates", fewer): (estimate, (None, small, query, key, Config())),
         },
         repeats,
         seconds=60,
@@ -56,9 +56,9 @@ def rows(quick: bool):
     on_cpu = jax.default_backend() == "cpu"
     for batch in (2,) if quick else BATCHES if on_cpu else ACCELERATOR_BATCHES:
         queries = jax.tree.map(lambda x, batch=batch: jnp.broadcast_to(x, (batch, *x.shape)), query)
-        many = (small, queries, jax.random.split(key, batch), Config())
+        many = (None, small, queries, jax.random.split(key, batch), Config())
         name = f"estimate, Config(), {batch} queries at once"
-        for found in measure({(name, fewer): (jax.vmap(estimate, (None, 0, 0, None)), many)}, 5, seconds=20):
+        for found in measure({(name, fewer): (jax.vmap(estimate, (None, None, 0, 0, None)), many)}, 5, seconds=20):
             found["queries_per_s"] = batch / (found["median_ms"] / 1e3)
             yield found
     if quick:
@@ -112,7 +112,7 @@ def refine_all(templates, query, poses, config):
 def score_all(templates, query, poses, config):
     """Every hypothesis compared with the depth and the features."""
     scene = Scene(query, config.score.resolution, config.refine.silhouette)
-    rate = lambda pose: score(templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
+    rate = lambda pose: score(None, templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
     return jax.vmap(rate)(poses)
 
 
@@ -121,7 +121,7 @@ def write_trace(folder: Path):
     templates = compact(problems.make_templates(40, 10, grid=16, channels=384))
     query, _ = problems.make_query(0, grid=16, channels=384, noise=0.3)
     run = jax.jit(estimate)
-    arguments = templates, query, jax.random.key(0), Config()
+    arguments = None, templates, query, jax.random.key(0), Config()
     jax.block_until_ready(run(*arguments))
     with jax.profiler.trace(str(folder), create_perfetto_trace=True):
         for _ in range(3):

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ipjax.features import describe, observe
     from ipjax.host.drawing import draw
     from ipjax.host.frames import frame
-    from ipjax.host.objects import compact, load, save
+    from ipjax.host.objects import compact, load, pad_templates, save
     from ipjax.host.onboarding import onboard
     from ipjax.host.weights import load_encoder
     from ipjax.pipeline import estimate
@@ -54,6 +54,7 @@ __all__ = [
     "load_encoder",
     "observe",
     "onboard",
+    "pad_templates",
     "save",
 ]
 
@@ -72,7 +73,7 @@ _HOMES = {
     "features": ("describe", "observe"),
     "host.drawing": ("draw",),
     "host.frames": ("frame",),
-    "host.objects": ("compact", "load", "save"),
+    "host.objects": ("compact", "load", "pad_templates", "save"),
     "host.onboarding": ("onboard",),
     "host.weights": ("load_encoder",),
     "pipeline": ("estimate",),

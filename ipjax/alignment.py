@@ -14,7 +14,6 @@ def align(
     size: Float[Array, "v"],
     key: PRNGKeyArray,
     config: AlignConfig = AlignConfig(),
-    *,
     diameter: Float[Array, ""] | None = None,
 ) -> tuple[Similarity, Float[Array, "h"], Bool[Array, "h k"], Bool[Array, "h"]]:
     """The best similarities ``camera_from_object`` of each view's pairs.

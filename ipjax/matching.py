@@ -41,19 +41,22 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     chosen = None
     if config.shortlist is not None and config.shortlist < every:
         with jax.named_scope("shortlist"):
-            chosen = jnp.sort(lax.top_k(resemblance(patches, query), config.shortlist)[1])
+            alike = jnp.where(jnp.any(patches.valid, axis=1), resemblance(patches, query), -2)
+            chosen = jnp.sort(lax.top_k(alike, config.shortlist)[1])
             patches = jax.tree.map(lambda x: x[chosen], patches)
     found = nearest(query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes)
     distance = jax.vmap(cycle_distance, (0, 0, None, None, 0))(
         found.query_to_template, found.template_to_query, query.grid, query.valid, patches.valid
     )
     pairs = min(config.pairs, query.valid.shape[0])
+    absent = ~jnp.any(patches.valid, axis=1)  # a view without a patch, such as padding, ranks behind all others
     if config.ranking == "cyclic":
         order, near, cosine = jax.vmap(_order)(distance, found.query_similarity)
         near, cosine = near[:, :pairs], jnp.where(jnp.isfinite(near), cosine, 0)[:, :pairs]
         # A missing pair costs the grid's diagonal, so that a view with few pairs does not win by having few terms.
         worst = jnp.sqrt(jnp.sum(jnp.max(query.grid, axis=0) ** 2)) + 1
         cost = jnp.sum(jnp.minimum(near, worst), axis=1)
+        cost = jnp.where(absent, jnp.max(cost) + 1, cost)
         ranking = -cost
         view = lax.sort((cost, -jnp.sum(cosine, axis=1), jnp.arange(cost.shape[0])), num_keys=2)[2][: config.views]
     else:
@@ -61,6 +64,7 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(
             jnp.sum(query.valid, dtype=jnp.float32), 1
         )
+        ranking = jnp.where(absent, jnp.min(ranking) - 1, ranking)
         view = lax.top_k(ranking, min(config.views, ranking.shape[0]))[1]
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]

@@ -102,8 +102,8 @@ def closest_symmetry(
     symmetries: Similarity,
     truth: Similarity,
     estimate: Similarity,
-    *,
     camera: Camera | None = None,
+    *,
     block: int = 8,
 ) -> tuple[Float[Array, ""], Int[Array, ""]]:
     """MSSD (or MSPD, given a camera) and the index of the symmetry that attains it.
@@ -186,7 +186,6 @@ def vsd(
     depth_truth: Float[Array, "h w"],
     camera: Camera,
     depth_estimate: Float[Array, "h w"],
-    *,
     diameter: float | Float[Array, ""],
     delta: float | Float[Array, ""],
     tolerances: Float[Array, "t"] | None = None,

@@ -21,26 +21,26 @@ from ipjax.types import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstim
 
 
 def estimate(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
     templates: Templates,
     query: Query,
     key: PRNGKeyArray,
     config: Config = Config(),
-    *,
     diameter: Float[Array, ""] | None = None,
-    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None = None,
 ) -> PoseEstimate:
     """The object's pose and size in the query's camera.
 
-    Write ``jax.jit(estimate)``; ``jax.vmap`` over queries, or over objects padded to one size, works too.
+    Write ``jax.jit(estimate)``. Every argument is positional, so that ``jax.vmap`` can map each of them: queries, keys,
+    diameters, and objects that ``ipjax.pad_templates`` has made alike.
 
     Args:
+      encoder: the one that described the query; with it the best candidates are drawn and described again, and only
+        they are among the hypotheses. Slower by one encoding for each, and surer. None = nothing is drawn.
       templates: the onboarded object.
       query: the described crop.
       key: of the minimal sets; same key, same answer.
       config: thresholds are traced, sizes and switches static.
-      diameter: the object's true diameter in metres, where it is known.
-      encoder: the one that described the query; with it the best candidates are drawn and described again, and only
-        they are among the hypotheses. Slower by one encoding for each, and surer.
+      diameter: the object's true diameter in metres; None = not known, the size is estimated, too.
 
     Returns:
       ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera.
@@ -56,7 +56,7 @@ def estimate(
     query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
-        poses, agreed, _, determined = align(pairs, size, key, config.align, diameter=diameter)
+        poses, agreed, _, determined = align(pairs, size, key, config.align, diameter)
     scale_known = diameter is not None
     scene = _Scene(query, config.score.resolution, config.refine.silhouette)
     unknown = jnp.zeros_like(agreed)
@@ -237,7 +237,9 @@ def _rate(
     templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config
 ) -> tuple[Float[Array, "h"], Agreement]:
     with jax.named_scope("score"):
-        rate = lambda pose: score(templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
+        rate = lambda pose: score(
+            None, templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score
+        )
         return jax.vmap(rate)(poses)
 
 
@@ -254,7 +256,7 @@ def _draw_best(
     chosen, ahead = distinct(found.poses, found.score, count, config.score.apart)
     kept = jax.tree.map(lambda x: x[chosen], found)
     camera = scene.cloud.camera
-    rate = lambda pose: score(templates, query, scene.depth, scene.mask, camera, pose, config.score, encoder=encoder)
+    rate = lambda pose: score(encoder, templates, query, scene.depth, scene.mask, camera, pose, config.score)
     with jax.named_scope("draw"):
         # One image at a time is fastest on a CPU; accelerators want them all.
         rated, agreement = lax.platform_dependent(kept.poses, cpu=lambda p: lax.map(rate, p), default=jax.vmap(rate))

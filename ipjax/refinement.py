@@ -273,7 +273,7 @@ def strained(surface: Surface, strain: Float[Array, "5"]) -> Surface:
       strain: E11, E22, E12, E13, E23, in the object's frame.
     """
     normals = surface.normals - _stretch(surface.normals, strain)
-    normals = normals / jnp.sqrt(jnp.sum(normals**2, axis=-1, keepdims=True))
+    normals = normals / jnp.sqrt(jnp.sum(normals**2, axis=-1, keepdims=True) + 1e-12)  # padding has none
     points = surface.points + _stretch(surface.points, strain)
     return eqx.tree_at(lambda s: (s.points, s.normals), surface, (points, normals))
 

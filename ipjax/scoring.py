@@ -20,6 +20,7 @@ from ipjax.types import Agreement, Camera, Patches, Query, Similarity, Surface, 
 
 
 def score(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
     templates: Templates,
     query: Query,
     depth: Float[Array, "g g"],
@@ -27,8 +28,6 @@ def score(
     camera: Camera,
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
-    *,
-    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None = None,
 ) -> tuple[Float[Array, ""], Agreement]:
     """The score in [0, 1] of one hypothesis, and its parts; the caller vmaps.
 
@@ -36,9 +35,9 @@ def score(
     wrong, and colours count, too.
 
     Args:
+      encoder: with it the hypothesis is drawn and described, too; None = it is not.
       query: its patches centred on the templates' mean, as the templates' are.
       depth, mask, camera: the query's crop on a coarse grid (metres, 0 = unknown; one pixel per cell).
-      encoder: with it the hypothesis is drawn and described, too.
     """
     geometry = depth_agreement(templates.surface, depth, mask, camera, camera_from_object, config)
     features = feature_agreement(templates, query, camera_from_object, config)
@@ -129,8 +128,10 @@ def feature_agreement(
     Patches behind an occluder are left out; those that fall outside the mask count as zero. Templates are weighted by
     the angle between their viewpoint and the hypothesis'.
     """
-    angle, views = lax.top_k(-closeness(templates, camera_from_object), min(config.views, templates.norm.shape[0]))
-    weight = jnp.exp(-jnp.square(angle / config.spread))
+    there = jnp.any(templates.patches.valid, axis=1)
+    nearness = jnp.where(there, -closeness(templates, camera_from_object), -10)
+    angle, views = lax.top_k(nearness, min(config.views, templates.norm.shape[0]))
+    weight = jnp.where(there[views], jnp.exp(-jnp.square(angle / config.spread)), 0)
     near = jax.tree.map(lambda x: x[views], templates.patches)
     cosines = jax.vmap(lambda patches: _carried_cosine(patches, query, camera_from_object, config))(near)
     return jnp.clip(jnp.sum(weight * cosines) / jnp.maximum(jnp.sum(weight), 1e-9), 0, 1)

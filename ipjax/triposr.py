@@ -373,8 +373,8 @@ def density_grid(
     model: TripoSR,
     triplane: Float[Array, "3 c h w"],
     resolution: int = 256,
-    *,
     start: int | Int[Array, ""] = 0,
+    *,
     count: int | None = None,
 ) -> Float[Array, "x r r"]:
     """Density at ``resolution``³ points, both faces of the cube included, index (x, y, z).

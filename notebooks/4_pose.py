@@ -84,7 +84,7 @@ find = jax.jit(ipjax.estimate)
 def look(mask, depth=scene.depth):
     """The estimate for one mask and depth image."""
     view = ipjax.frame(scene.rgb, depth, mask, scene.matrix, resolution=168)
-    return find(templates, ipjax.observe(encoder, view), jax.random.key(0), config)
+    return find(None, templates, ipjax.observe(encoder, view), jax.random.key(0), config)
 
 
 def error(found):

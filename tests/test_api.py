@@ -6,16 +6,18 @@ import inspect
 import re
 import typing
 
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 from test_layers import LAYERS, MODULES, layer_of
 
 import ipjax
 
 FIXED = {"encoder", "templates", "surface", "estimator", "model"}  # made once per object, or once
 NEW = {"query", "view", "cloud", "pairs", "patches", "rgb", "depth", "mask", "image", "photo"}  # once per frame
-LAST = ("key", "config")
+LAST = ("key", "config", "diameter")  # the last is known of some objects only, and None by default
 # Where the arrow starts comes first: both directions are searched, and the cycle starts at the query.
 AS_KERNEL = {"match", "select", "nearest", "search", "cycle_distance"}
 KEY_FIRST = {"draw_minimal_sets", "consensus"}  # samplers, as in jax.random
@@ -68,13 +70,51 @@ def find_disorder(name: str, function) -> list[str]:
     parameters = inspect.signature(function).parameters
     # A network's own record says what it is made of, and belongs to what is fixed.
     last = [n for n in LAST if n != "config" or n not in parameters or not is_architecture(parameters[n].annotation)]
+    if "config" not in names:
+        last.remove("diameter")  # then it is one of what is given, as in a metric
     tail = [n for n in names if n in last]
     if short not in KEY_FIRST and tail and names[-len(tail) :] != [n for n in last if n in tail]:
-        faults.append(f"{name}({', '.join(names)}): key, then config, come last; what follows is keyword-only")
+        faults.append(f"{name}({', '.join(names)}): key, config, diameter come last; what follows is keyword-only")
     ranks = [0 if n in FIXED else 1 for n in names if n in FIXED | NEW]
     if short not in AS_KERNEL and ranks != sorted(ranks):
         faults.append(f"{name}({', '.join(names)}): what is fixed comes before what is new")
     return faults
+
+
+def holds_arrays(annotation) -> bool:
+    """Whether what is annotated so may hold arrays: an array, a record or a network, or one of several such."""
+    if hasattr(annotation, "array_type") or typing.get_origin(annotation) is collections.abc.Callable:
+        return True
+    if inspect.isclass(annotation) and issubclass(annotation, eqx.Module):
+        return True
+    return any(holds_arrays(inner) for inner in typing.get_args(annotation))
+
+
+def find_unmappable(name: str, function) -> list[str]:
+    """What `jax.vmap` cannot map one by one, for it gives every keyword's arrays the first axis."""
+    parameters = inspect.signature(function).parameters.values()
+    return [
+        f"{name}: {p.name} holds arrays" for p in parameters if p.kind is p.KEYWORD_ONLY and holds_arrays(p.annotation)
+    ]
+
+
+@pytest.mark.parametrize("module", [m for m in PURE if m.startswith("ipjax.")])
+def test_what_vmap_maps_is_positional(module):
+    faults = [f for name, function in list_functions([module]).items() for f in find_unmappable(name, function)]
+    assert faults == []
+
+
+def test_finds_what_cannot_be_mapped():
+    def size(query, *, diameter: Float[Array, ""] | None = None): ...
+
+    def record(query, *, camera: ipjax.Camera): ...
+
+    def network(query, *, encoder: collections.abc.Callable[[Float[Array, "h"]], Float[Array, "c"]] | None = None): ...
+
+    def options(query, diameter: Float[Array, ""] | None = None, *, block: int = 3, known: bool = False): ...
+
+    assert all(find_unmappable("f", function) for function in (size, record, network))
+    assert find_unmappable("f", options) == []
 
 
 @pytest.mark.parametrize("module", [*PURE, *HOST])
@@ -88,9 +128,13 @@ def test_finds_disorder():
 
     def swapped(query, templates): ...
 
-    def good(templates, query, key, config, *, diameter): ...
+    def early(templates, query, diameter, key, config): ...
 
-    assert find_disorder("late", late) and find_disorder("swapped", swapped)
+    def behind(templates, query, encoder, key, config, diameter): ...
+
+    def good(encoder, templates, query, key, config, diameter): ...
+
+    assert all(find_disorder("f", function) for function in (late, swapped, early, behind))
     assert find_disorder("good", good) == []
 
 

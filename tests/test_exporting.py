@@ -50,7 +50,7 @@ def test_the_artifact_runs_without_ipjax(templates, tmp_path):
     arguments = [str(path), str(tmp_path / "in.npz"), str(tmp_path / "out.npz")]
     subprocess.run([sys.executable, "-c", RUN, *arguments], check=True, capture_output=True, timeout=300)
     out = np.load(tmp_path / "out.npz")
-    found = jax.jit(ipjax.estimate)(templates, query, key, TINY)
+    found = jax.jit(ipjax.estimate)(None, templates, query, key, TINY)
     assert int(out["view"]) == int(found.view)
     np.testing.assert_allclose(out["rotation"], found.camera_from_object.rotation, atol=2e-3)
     np.testing.assert_allclose(out["scale"], found.camera_from_object.scale, rtol=2e-3)

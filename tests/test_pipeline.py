@@ -24,6 +24,7 @@ TINY = Config(
     score=ScoreConfig(resolution=28, alternates=0),
 )
 TURNED = dataclasses.replace(TINY, score=ScoreConfig(resolution=28, alternates=1))
+DRAWN = dataclasses.replace(TINY, score=ScoreConfig(resolution=28, alternates=0, drawn=2))
 TRACES = []
 
 
@@ -31,7 +32,7 @@ TRACES = []
 def estimate(templates, query, key, config, diameter=None):
     """Compiled once for each of the configurations above, not once per test."""
     TRACES.append(config)
-    return ipjax.estimate(templates, query, key, config, diameter=diameter)
+    return ipjax.estimate(None, templates, query, key, config, diameter)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +105,7 @@ def test_vmap_over_queries_equals_the_loop(templates):
     queries = [problems.make_query(seed)[0] for seed in (3, 4)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *queries)
     keys = jax.random.split(jax.random.key(1), 2)
-    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, None)))(templates, stacked, keys, TINY)
+    together = jax.jit(jax.vmap(ipjax.estimate, (None, None, 0, 0, None)))(None, templates, stacked, keys, TINY)
     for index, query in enumerate(queries):
         alone = estimate(templates, query, keys[index], TINY)
         one = jax.tree.map(lambda x, index=index: x[index], together)
@@ -178,34 +179,73 @@ def test_what_does_not_fit_is_said(templates, change, message):
     config.update("jaxtyping_disable", True)  # it would speak first
     try:
         with pytest.raises(ValueError, match=message):
-            ipjax.estimate(templates, change(query), jax.random.key(0), TINY)
+            ipjax.estimate(None, templates, change(query), jax.random.key(0), TINY)
     finally:
         config.update("jaxtyping_disable", False)
 
 
-def test_objects_padded_to_one_size_equal_the_loop(templates):
-    """Six views and two that hold nothing are six views; together with another object as alone."""
-    six = eqx.tree_at(
-        lambda t: (t.patches, t.norm, t.seen, t.camera_from_object, t.camera),
-        templates,
-        jax.tree.map(
-            lambda x: x[:6],
-            (templates.patches, templates.norm, templates.seen, templates.camera_from_object, templates.camera),
-        ),
-    )
-    keep = jnp.arange(8)[:, None] < 6
-    padded = eqx.tree_at(lambda t: t.patches.valid, templates, templates.patches.valid & keep)
-    both = jax.tree.map(lambda *x: jnp.stack(x), templates, padded)
-    query, _ = problems.make_query(11)
-    queries = jax.tree.map(lambda x: jnp.stack([x, x]), query)
+def two_objects():
+    """The ellipsoid onboarded twice: more and fewer views, patches, and points of surface and appearance."""
+    large = dataclasses.replace(problems.make_templates(), appearance=problems.make_appearance(20_000))
+    few = jax.tree.map(lambda x: x[:6], (VIEWS(large)))
+    small = eqx.tree_at(VIEWS, large, few)
+    small = dataclasses.replace(small, surface=problems.make_surface(300), appearance=problems.make_appearance(14_000))
+    return large, ipjax.compact(small, multiple=8)
+
+
+VIEWS = lambda t: (t.patches, t.norm, t.seen, t.camera_from_object, t.camera)
+
+
+def make_sized_query(seed: int, diameter: float):
+    """As `problems.make_query`, of an object of that diameter, farther or nearer in proportion."""
+    query, truth = problems.make_query(seed)
+    factor = jnp.asarray(diameter, jnp.float32) / truth.scale
+    sized = lambda q: (q.patches.points, q.view.depth)
+    query = eqx.tree_at(sized, query, jax.tree.map(lambda x: x * factor, sized(query)))
+    return query, Similarity(truth.rotation, truth.translation * factor, truth.scale * factor)
+
+
+def test_vmap_over_padded_objects_queries_and_diameters_equals_the_loop():
+    """A padded object gives the answer that it gives alone, drawn and with its size known, beside a larger one."""
+    encoder = problems.make_encoder()
+    objects, diameters = two_objects(), jnp.array([0.12, 0.09])
+    padded = ipjax.pad_templates(objects)
+    assert padded.patches.features.shape[:3] == (2, 8, 64) and padded.appearance.points.shape[:2] == (2, 20_000)
+    queries = [make_sized_query(seed, size)[0] for seed, size in zip((11, 12), (0.12, 0.09), strict=True)]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *queries)
     keys = jax.random.split(jax.random.key(3), 2)
-    config = Config.paper()
-    together = jax.jit(jax.vmap(ipjax.estimate, (0, 0, 0, None)))(both, queries, keys, config)
-    for index, one in enumerate((templates, six)):
-        alone = jax.jit(ipjax.estimate)(one, query, keys[index], config)
+    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, 0, None, 0)))
+    together = together(encoder, padded, stacked, keys, DRAWN, diameters)
+    alone = jax.jit(ipjax.estimate)
+    for index, one in enumerate(objects):
+        wanted = alone(encoder, one, queries[index], keys[index], DRAWN, diameters[index])
         found = jax.tree.map(lambda x, index=index: x[index], together)
-        assert int(found.view) == int(alone.view) and int(found.inliers) == int(alone.inliers)
-        same(found.camera_from_object, alone.camera_from_object, 1e-3)
+        assert int(found.view) == int(wanted.view) and int(found.inliers) == int(wanted.inliers)
+        same(found.camera_from_object, wanted.camera_from_object, 1e-3)
+        views = one.norm.shape[0]
+        np.testing.assert_allclose(found.view_score[:views], wanted.view_score, atol=1e-4)
+        assert (np.asarray(found.view_score[views:]) < np.asarray(wanted.view_score).min()).all()
+        for name in ("confidence", "covariance", "ambiguity", "agreement"):
+            jax.tree.map(
+                lambda x, y: np.testing.assert_allclose(x, y, rtol=2e-2, atol=2e-3),
+                getattr(found, name),
+                getattr(wanted, name),
+            )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: dataclasses.replace(t, appearance=None), "have their appearance"),
+        (lambda t: eqx.tree_at(lambda t: t.patches.features, t, t.patches.features[..., :16]), "one shape"),
+        (lambda t: jax.tree.map(lambda x: x[None], t), "single objects"),
+    ],
+)
+def test_objects_that_are_not_alike_are_not_padded(change, message):
+    with pytest.raises(ValueError, match=message):
+        ipjax.pad_templates([two_objects()[0], change(two_objects()[1])])
+    with pytest.raises(ValueError, match="at least one"):
+        ipjax.pad_templates([])
 
 
 def test_with_the_encoder_candidates_are_drawn(templates):
@@ -216,12 +256,12 @@ def test_with_the_encoder_candidates_are_drawn(templates):
     run = jax.jit(ipjax.estimate)
     for seed in range(4):
         query, truth = problems.make_query(seed, noise=0.3)
-        found = run(known, query, jax.random.key(0), config, encoder=encoder)
+        found = run(encoder, known, query, jax.random.key(0), config)
         assert found.hypotheses.score.shape == (3,)
         assert bool(jnp.all(jnp.diff(found.hypotheses.score) <= 0))
         relative = np.asarray(found.camera_from_object.rotation).T @ np.asarray(truth.rotation)
         assert np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1))) < 15
-    plain = run(templates, query, jax.random.key(0), config, encoder=encoder)
+    plain = run(encoder, templates, query, jax.random.key(0), config)
     assert plain.hypotheses.score.shape[0] > 3  # without an appearance nothing can be drawn
 
 
@@ -229,7 +269,7 @@ def test_fewer_hypotheses_than_are_tried_turned(templates):
     """One view and one hypothesis of it: what there is, is turned."""
     config = dataclasses.replace(TURNED, match=MatchConfig(views=1), score=ScoreConfig(resolution=28, alternates=3))
     query, _ = problems.make_query(0)
-    found = jax.eval_shape(lambda: ipjax.estimate(templates, query, jax.random.key(0), config))
+    found = jax.eval_shape(lambda: ipjax.estimate(None, templates, query, jax.random.key(0), config))
     assert found.hypotheses.score.shape == (2 * config.align.keep,)
 
 
@@ -295,4 +335,4 @@ def test_fewer_channels_still_recover_pose_and_size(templates):
         assert_near(found.camera_from_object, truth, 0.15, 0.15)
     with pytest.raises(ValueError, match="16 channels"):
         query, _ = problems.make_query(0, channels=16)
-        ipjax.estimate(short, query, jax.random.key(0), TINY)
+        ipjax.estimate(None, short, query, jax.random.key(0), TINY)

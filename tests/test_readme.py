@@ -6,7 +6,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+import problems
 import pytest
+import test_pipeline
 
 import ipjax
 from ipjax.host import onboarding
@@ -28,7 +30,7 @@ def test_quickstart_runs(tmp_path, monkeypatch):
         resolve()
     except WeightsError as error:
         pytest.skip(f"no weights on this machine: {error}")
-    (code,) = find_blocks("python")
+    code, _ = find_blocks("python")
     small = ipjax.OnboardConfig(directions=16, rolls=6)
     quick = ipjax.Config(
         match=ipjax.MatchConfig(views=4),
@@ -58,8 +60,25 @@ def test_quickstart_runs(tmp_path, monkeypatch):
     assert jax.tree.all(jax.tree.map(lambda x: bool(np.isfinite(x).all()), found.camera_from_object))
 
 
+def test_many_at_once_runs(monkeypatch):
+    """Word for word: two objects of different sizes, a query of each, and their diameters. With the tests' encoder."""
+    _, code = find_blocks("python")
+    monkeypatch.setattr(ipjax, "Config", lambda: test_pipeline.DRAWN)
+    names = {"ipjax": ipjax, "encoder": problems.make_encoder()}
+    names["mug"], names["tin"] = test_pipeline.two_objects()
+    diameters = 0.12, 0.09  # as the text says
+    names["first"], first = test_pipeline.make_sized_query(0, diameters[0])
+    names["second"], second = test_pipeline.make_sized_query(1, diameters[1])
+    exec(compile(code, str(README), "exec"), names)
+    poses = names["found"].camera_from_object
+    for index, truth in enumerate((first, second)):
+        pose = jax.tree.map(lambda x, index=index: x[index], poses)
+        test_pipeline.assert_near(pose, truth, 0.05, 1e-6)
+        assert test_pipeline.rotation_error(pose, truth) < 15
+
+
 def test_quickstart_is_ten_lines():
-    (code,) = find_blocks("python")
+    code, _ = find_blocks("python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
 
 

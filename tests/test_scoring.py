@@ -223,7 +223,7 @@ def test_guessed_surface_is_judged_by_its_shape_alone(templates, case):
     def rate(look, seen):
         surface = dataclasses.replace(templates.surface, seen=jnp.full(len(templates.surface.seen), seen))
         known = dataclasses.replace(templates, surface=surface, appearance=look)
-        return float(score(known, query, depth, mask, camera, truth, CONFIG, encoder=encoder)[0])
+        return float(score(encoder, known, query, depth, mask, camera, truth, CONFIG)[0])
 
     assert rate(wrong, 0.0) == pytest.approx(rate(appearance, 0.0), rel=1e-5)
     assert rate(wrong, 1.0) < rate(wrong, 0.0) < rate(appearance, 1.0)

@@ -83,7 +83,7 @@ class Estimator:
         templates, info = self.objects[index]
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)
-        known: dict[str, Any] = {} if diameter is None else {"diameter": jnp.asarray(diameter, jnp.float32)}
+        known = None if diameter is None else jnp.asarray(diameter, jnp.float32)
 
         described: Any = patches
         if described is None:
@@ -93,20 +93,20 @@ class Estimator:
             seconds["describe"] = time.perf_counter() - start
 
         query = Query(patches=described, view=view)
-        known["encoder"] = self.encoder
-        find = self._ready("estimate", estimate, seconds, templates, query, key, self.config, **known)
+        arguments = self.encoder, templates, query, key, self.config, known
+        find = self._ready("estimate", estimate, seconds, *arguments)
         start = time.perf_counter()
-        found = jax.block_until_ready(find(templates, query, key, self.config, **known))
+        found = jax.block_until_ready(find(*arguments))
         seconds["estimate"] = time.perf_counter() - start
         return Result(_turn(camera_from_crop, found), found, query, templates, info, seconds)
 
-    def _ready(self, name: str, function: Any, seconds: dict[str, float], *args: Any, **known: Any):
-        leaves, structure = jax.tree.flatten((args, known))
+    def _ready(self, name: str, function: Any, seconds: dict[str, float], *args: Any):
+        leaves, structure = jax.tree.flatten(args)
         shapes = tuple((np.shape(x), str(getattr(x, "dtype", type(x)))) for x in leaves)
         key = (name, structure, shapes)
         if key not in self._compiled:
             start = time.perf_counter()
-            self._compiled[key] = jax.jit(function).lower(*args, **known).compile()
+            self._compiled[key] = jax.jit(function).lower(*args).compile()
             seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - start
         return self._compiled[key]
 

@@ -76,7 +76,7 @@ def estimate_dictionaries(
     config: Config = Config(),
 ) -> dict[str, Any]:
     """``estimate`` from and to dictionaries of arrays; ``key`` is uint32 [2]."""
-    found = estimate(_to_templates(templates), _to_query(query), jax.random.wrap_key_data(key), config)
+    found = estimate(None, _to_templates(templates), _to_query(query), jax.random.wrap_key_data(key), config)
     return to_dictionary(found)
 
 

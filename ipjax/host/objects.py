@@ -19,6 +19,7 @@ Lengths are model units: the object's bounding box is centred at the origin and 
 import dataclasses
 import hashlib
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -318,6 +319,75 @@ def compact(templates: Templates, *, multiple: int = 32) -> Templates:
         patches=jax.tree.map(take, templates.patches),
         norm=take(templates.norm),
         seen=take(templates.seen),
+    )
+
+
+def pad_templates(objects: Sequence[Templates]) -> Templates:
+    """Several objects' templates padded to one size and stacked, so that ``jax.vmap(estimate, …)`` takes them at once.
+
+    What is added is absent. Patches are not valid. Views repeat the last one's pose and camera without a valid patch:
+    they rank behind all others and lend no features. Surface and appearance points repeat the first one without a
+    normal: they face no camera, so nothing is fitted to them and they are not drawn, and no outline is wider for them.
+    An object gives the same answer as alone, up to rounding, if it has no fewer views than ``config.match.views`` and
+    no fewer surface points than ``config.refine.points``; with fewer, it is tried and refined as often as the others.
+
+    Args:
+        objects: each as ``load`` or ``onboard`` return it, or after ``compact``; not batched.
+
+    Returns:
+        Templates with a leading axis of the objects.
+
+    Raises:
+        ValueError: there is none, or they are not alike: features of different lengths, or some of them with a basis or
+            an appearance and some without.
+    """
+    objects = list(objects)
+    if not objects:
+        raise ValueError("pad_templates takes at least one object's templates")
+    shapes = {(np.ndim(o.patches.features), *(np.shape(x)[-1] for x in (o.patches.features, o.mean))) for o in objects}
+    if len(shapes) > 1 or next(iter(shapes))[0] != 3:
+        raise ValueError(
+            "pad_templates takes single objects whose features have one shape [views, patches, channels], not "
+            + " and ".join(str(np.shape(o.patches.features)) for o in objects)
+        )
+    for name in ("basis", "appearance"):
+        if len({getattr(o, name) is None for o in objects}) > 1:
+            raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
+    views, patches = (max(o.norm.shape[axis] for o in objects) for axis in (0, 1))
+    count = max(o.surface.points.shape[0] for o in objects)
+    drawn = max(0 if o.appearance is None else o.appearance.points.shape[0] for o in objects)
+    padded = [_pad(o, views, patches, count, drawn) for o in objects]
+    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
+
+
+def _pad(templates: Templates, views: int, patches: int, count: int, drawn: int) -> Templates:
+    """One object's templates with so many views, patches in each, and points of surface and appearance."""
+
+    def grown(array: Any, *sizes: int, repeat: int | None = None):
+        """With rows of zeros, or of one that is repeated, at the end of the first axes."""
+        array = np.asarray(array)
+        for axis, size in enumerate(sizes):
+            more = size - array.shape[axis]
+            row = np.take(array, [0 if repeat is None else repeat], axis)
+            row = np.zeros_like(row) if repeat is None else row
+            array = np.concatenate([array, np.repeat(row, more, axis)], axis)
+        return jnp.asarray(array)
+
+    def points(record: Any, size: int):
+        fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+        more = {name: grown(value, size) for name, value in fields.items() if name != "points"}
+        return type(record)(points=grown(record.points, size, repeat=0), **more)
+
+    last = lambda tree: jax.tree.map(lambda x: grown(x, views, repeat=-1), tree)
+    return dataclasses.replace(
+        templates,
+        patches=jax.tree.map(lambda x: grown(x, views, patches), templates.patches),
+        norm=grown(templates.norm, views, patches),
+        seen=grown(templates.seen, views, patches),
+        camera_from_object=last(templates.camera_from_object),
+        camera=last(templates.camera),
+        surface=points(templates.surface, count),
+        appearance=None if templates.appearance is None else points(templates.appearance, drawn),
     )
 
 
