@@ -53,7 +53,7 @@ def _is_told(error: BaseException) -> bool:
     """Whether the message is meant for the user; a RuntimeError is only where no renderer works or memory ends."""
     if not isinstance(error, RuntimeError):
         return True
-    return type(error).__name__ == "RenderError" or "RESOURCE_EXHAUSTED" in str(error)
+    return any(kind.__name__ == "RenderError" for kind in type(error).__mro__) or "RESOURCE_EXHAUSTED" in str(error)
 
 
 def _in_one_line(error: BaseException) -> str:

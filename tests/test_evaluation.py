@@ -353,7 +353,32 @@ def test_a_failure_stops_or_counts_as_a_miss(small, tmp_path):
         run(small, tmp_path / "a", fails)
     found = run(small, tmp_path / "b", fails, on_error="skip")
     assert found.missing == 4
-    assert "2 images failed and count as misses" in found.table() and "no pose today" in found.table()
+    table = found.table()
+    assert "2 images failed, count as misses" in table
+    for reason in ("scene 0, image 1: RuntimeError: no pose today", "scene 0, image 2: ValueError: the estimate of"):
+        assert reason in table
+
+
+def test_what_failed_for_a_passing_reason_is_tried_again(small, tmp_path):
+    good, whole = Noisy(small), run(small, tmp_path / "whole", Noisy(small))
+    lines = lambda folder: [x.rsplit(",", 1)[0] for x in next(folder.glob("*.csv")).read_text().splitlines()]
+    for fails, calls in ((2, 4), (1, 2), (0, 1)):  # images that fail, images that are tried
+        tried: list[int] = []
+
+        def sometimes(frame, targets, tried=tried, fails=fails):
+            tried.append(frame.im_id)
+            if len(tried) <= fails:
+                raise OSError(28, "No space left on device")
+            return good(frame, targets)
+
+        found = run(small, tmp_path / "b", sometimes, on_error="skip")
+        assert len(tried) == calls
+        assert found.table().count("OSError: [Errno 28] No space left on device") == fails
+    assert found.all_frames.recalls == whole.all_frames.recalls and found.notes == whole.notes
+    assert lines(tmp_path / "b") == lines(tmp_path / "whole")
+    untouched = Noisy(small)
+    run(small, tmp_path / "b", untouched, on_error="skip")
+    assert untouched.calls == []
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no file locks of this kind")

@@ -2,7 +2,8 @@
 
 MuJoCo reads MUJOCO_GL when it is imported and a wrong value can abort the process, so the parent chooses it and only
 this child runs GL. It needs NumPy and MuJoCo alone, to start fast. Arguments: the folder of the job. In: ``job.json``
-and the arrays beside it. Out: ``rgb.npy``, ``depth.npy``, ``ids.npy``, and one line per frame on standard output.
+and the arrays beside it. Out: ``rgb.npy``, ``depth.npy``, ``ids.npy``, and lines on standard output:
+``ready`` when there is something to draw in, ``frame N`` after each, ``done``; or ``refused`` or ``error`` and why.
 """
 # pyright: reportAttributeAccessIssue=false
 # (MuJoCo's bindings declare their names at run time.)
@@ -147,6 +148,7 @@ def main(folder: Path) -> None:
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
     if context.currentBuffer != mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value:
         raise RuntimeError("no offscreen framebuffer")
+    print("ready", flush=True)
     context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
     stop_mipmaps(context, job["atlases"])
 

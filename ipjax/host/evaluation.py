@@ -51,6 +51,7 @@ YCBV_SYMMETRIC = frozenset({1, 13, 14, 16, 18, 19, 20, 21})  # ADD(-S) uses ADD-
 DELTA = 0.015  # metres: VSD's visibility tolerance
 # Targets below which no AUC is told: the toolbox's curve takes its higher value, so one target under 10 cm is 1.
 FEW = 10
+LISTED = 20  # images that failed and are told with their reason
 DETECTIONS = 100  # estimates per image that count for average precision (BOP 2024)
 BATCH = 64  # pairs of poses per call
 DRAWN = 48_000_000  # pixels drawn by one process for VSD; seven bytes each
@@ -1039,7 +1040,7 @@ def evaluate(
         detections: masks to use; default: the annotated visible masks.
         alignments: for objects whose estimates are of a reconstructed mesh (see `Alignment`).
         on_error: "raise" stops at a damaged file or a failing estimator; "skip" records the failure, which counts as a
-            miss, and goes on.
+            miss, and goes on; the next call tries it again.
         metrics, against, symmetric, without: see `score`.
         restart: begin anew, forgetting what is in the folder: always, or where it was made with other settings.
 
@@ -1073,7 +1074,8 @@ def evaluate(
     results = folder / f"{method.replace('_', '-')}_{dataset.name}-{dataset.split}.csv"
     with _locked(folder):
         journal = Journal(folder / "results.jsonl", head, restart)
-        missing = [image for image in images if image not in journal.done]
+        # What failed may have failed for a passing reason.
+        missing = [image for image in images if image not in journal.done or journal.done[image].error]
         for image in _bar(missing, progress, "images", done=len(images) - len(missing), total=len(images)):
             try:
                 frame = dataset.frame(*image)
@@ -1099,10 +1101,13 @@ def evaluate(
                 journal.append(image, rows, seconds, None)
         ordered = [pair for image in images for pair in journal.done[image].rows]
         write_results(results, [row for row, _ in ordered])
-        failed = [f"scene {s}, image {i}: {journal.done[s, i].error}" for s, i in images if journal.done[s, i].error]
+        failed = [f"scene {s}, image {i}: {error}" for s, i in images if (error := journal.done[s, i].error)]
         notes = [*getattr(estimator, "notes", ()), *_alignment_notes(alignments)]
         if failed:
-            notes.append(f"{len(failed)} images failed and count as misses, the first: {failed[0]}")
+            notes.append(f"{len(failed)} images failed, count as misses, and will be tried again at the next call")
+            notes += failed[:LISTED]
+            if len(failed) > LISTED:
+                notes.append(f"{len(failed) - LISTED} more failed; results.jsonl has their reasons")
         found_score = score(
             [row for row, _ in ordered],
             dataset,

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -33,8 +34,12 @@ _HELP = {
     "osmesa": "install libosmesa6 (Debian, Ubuntu: apt install libosmesa6)",
     "native": "a desktop session is needed for the native GL of this system",
 }
-_TIMEOUT = 180.0  # seconds without a word from the child
-_broken: dict[str, str] = {}  # backends that failed in this process, and why
+_CHILD = Path(__file__).with_name("_render_child.py")
+_TIMEOUT = 180.0  # seconds without a word from a child that does not use the processor either
+_LONGEST = 3600.0  # seconds without a word, whatever it does
+_REST = 600.0  # seconds for which a backend that could not be had is left alone
+_LAST = 2  # failures in a row, each before a context was there, after which it is
+_failed: dict[str, list[tuple[float, str]]] = {}  # such failures in a row, by backend: when, and why
 
 
 class RenderError(RuntimeError):
@@ -43,6 +48,12 @@ class RenderError(RuntimeError):
 
 class _MeshRefusedError(RenderError):
     """MuJoCo did not take the mesh; no fault of the GL backend."""
+
+
+class _NoContextError(RenderError):
+    """The backend failed before it could draw anything: it may not work on this system."""
+
+    silent = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -184,7 +195,7 @@ def available_backends() -> dict[str, str]:
     report = {}
     for name in [*_candidates(), "raster"]:
         try:
-            drawn = _draw_raster(job, None) if name == "raster" else _draw_mujoco(job, name, None)
+            drawn = _draw_raster(job, None) if name == "raster" else _run_child(job, name, None)
             report[name] = "ok" if drawn.mask.any() else "drew nothing"
         except RenderError as error:
             report[name] = str(error)
@@ -256,8 +267,11 @@ def _draw(job: _Job, backend: str, progress: Callable[[int, int], None] | None) 
         if backend not in BACKENDS:
             raise ValueError(f"unknown rendering backend {backend!r}: one of auto, {', '.join(BACKENDS)}")
         return _draw_mujoco(job, backend, progress)
+    reasons = []
     for name in _candidates():
-        if name in _broken:
+        failures = _failed.get(name, [])
+        if len(failures) >= _LAST and time.monotonic() - failures[-1][0] < _REST:
+            reasons.append(failures[-1][1])
             continue
         try:
             return _draw_mujoco(job, name, progress)
@@ -265,8 +279,8 @@ def _draw(job: _Job, backend: str, progress: Callable[[int, int], None] | None) 
             log.warning("%s; rendering with the z-buffer rasteriser", error)
             return _draw_raster(job, progress)
         except RenderError as error:
-            _broken[name] = str(error)
-    log.warning("no GL library works, rendering with the z-buffer rasteriser: %s", "; ".join(_broken.values()))
+            reasons.append(str(error))
+    log.warning("no GL library works, rendering with the z-buffer rasteriser: %s", "; ".join(reasons))
     return _draw_raster(job, progress)
 
 
@@ -351,20 +365,46 @@ def _write_job(job: _Job, folder: Path) -> None:
 
 
 def _draw_mujoco(job: _Job, backend: str, progress: Callable[[int, int], None] | None) -> Renders:
+    """Draw with MuJoCo, once more where it fails, for what fails once may be the machine's state and not the backend.
+
+    Only failures in a row before anything could be drawn are remembered, and those only for a while. RenderError in
+    one sentence if it fails.
+    """
+    for last in (False, True):
+        try:
+            drawn = _run_child(job, backend, progress)
+        except _MeshRefusedError:
+            raise
+        except _NoContextError as error:
+            failures = _failed.setdefault(backend, [])
+            failures.append((time.monotonic(), str(error)))
+            # Silence has taken long enough; and after its rest a backend gets one chance, not two.
+            if last or error.silent or len(failures) > _LAST:
+                raise
+        except RenderError as error:
+            if last:
+                raise
+            log.info("%s; once more", error)
+        else:
+            _failed.pop(backend, None)
+            return drawn
+    raise AssertionError
+
+
+def _run_child(job: _Job, backend: str, progress: Callable[[int, int], None] | None) -> Renders:
     """Run the child and collect its frames; RenderError in one sentence if it fails."""
     environment = dict(os.environ)
     for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM"):
         environment.pop(name, None)
     if backend != "native":
         environment["MUJOCO_GL"] = backend
-    child = Path(__file__).with_name("_render_child.py")
     with tempfile.TemporaryDirectory(prefix="ipjax-render-") as name:
         folder = Path(name)
         _write_job(job, folder)
         with open(folder / "stderr.txt", "wb") as stderr:
             # -P: the child's own folder must not shadow other packages' names.
             process = subprocess.Popen(
-                [sys.executable, "-P", str(child), str(folder)],
+                [sys.executable, "-P", str(_CHILD), str(folder)],
                 stdout=subprocess.PIPE,
                 stderr=stderr,
                 stdin=subprocess.DEVNULL,
@@ -372,19 +412,23 @@ def _draw_mujoco(job: _Job, backend: str, progress: Callable[[int, int], None] |
                 text=True,
             )
             try:
-                reason = _listen(process, len(job.poses), progress)
+                said = _listen(process, len(job.poses), progress)
             finally:
                 if process.poll() is None:
                     process.kill()
                 process.wait()
                 if process.stdout is not None:
                     process.stdout.close()
-        if reason is not None and reason.startswith("refused "):
-            raise _MeshRefusedError(f"MuJoCo refuses the mesh ({reason[8:][:300]})")
-        if reason is not None:
+        if said.end == "refused":
+            raise _MeshRefusedError(f"MuJoCo refuses the mesh ({said.reason[:300]})")
+        if said.end != "done":
             lines = (folder / "stderr.txt").read_text(errors="replace").strip().splitlines()
-            detail = reason or (lines[-1] if lines else f"the process ended with status {process.returncode}")
-            raise RenderError(f"MuJoCo cannot draw with {backend} ({detail[:300]}); {_HELP[backend]}")
+            detail = said.reason or (lines[-1] if lines else f"the process ended with status {process.returncode}")
+            if said.ready:
+                raise RenderError(f"MuJoCo with {backend} stopped drawing ({detail[:300]})")
+            error = _NoContextError(f"MuJoCo cannot draw with {backend} ({detail[:300]}); {_HELP[backend]}")
+            error.silent = said.end == "silent"
+            raise error
         depth = np.load(folder / "depth.npy")
         depth *= job.scales[:, None, None].astype(np.float32)
         return Renders(
@@ -396,8 +440,17 @@ def _draw_mujoco(job: _Job, backend: str, progress: Callable[[int, int], None] |
         )
 
 
-def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int], None] | None) -> str | None:
-    """Follow the child's lines; None when it is done, otherwise what it said (perhaps nothing)."""
+@dataclasses.dataclass(frozen=True)
+class _Said:
+    """How a child ended."""
+
+    end: str  # done, refused, error, died, silent
+    reason: str
+    ready: bool  # whether it had a context to draw in
+
+
+def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int], None] | None) -> _Said:
+    """Follow the child's lines to its end, or until it is neither heard nor working."""
     lines: queue.Queue[str | None] = queue.Queue()
 
     def read() -> None:
@@ -408,31 +461,46 @@ def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int]
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
+    ready = False
+    heard, worked = time.monotonic(), _processor_seconds(process.pid)
     try:
         while True:
             try:
                 line = lines.get(timeout=_TIMEOUT)
             except queue.Empty:
-                return f"no answer for {_TIMEOUT:.0f} s"
+                silence, now = time.monotonic() - heard, _processor_seconds(process.pid)
+                # A large mesh, or a processor that draws what a GPU should, takes long without a word.
+                if now - worked > 0.01 * _TIMEOUT and silence < _LONGEST:
+                    worked = now
+                    continue
+                return _Said("silent", f"no answer for {silence:.0f} s", ready)
+            heard, worked = time.monotonic(), _processor_seconds(process.pid)
             if line is None:
-                return ""
+                return _Said("died", "", ready)
             word, _, rest = line.strip().partition(" ")
-            if word == "frame" and progress is not None:
+            if word == "ready":
+                ready = True
+            elif word == "frame" and progress is not None:
                 progress(int(rest), total)
-            elif word == "refused":
-                return f"refused {rest}"
-            elif word == "error":
-                return rest
-            elif word == "done":
-                return None
+            elif word in ("refused", "error", "done"):
+                return _Said(word, rest, ready)
     finally:
         if process.poll() is None and process.stdout is not None:
             # The child says "done" last; give it a moment to leave by itself.
             try:
-                process.wait(timeout=10)
+                process.wait(timeout=min(10, _TIMEOUT))
             except subprocess.TimeoutExpired:
                 process.kill()
         reader.join(timeout=10)
+
+
+def _processor_seconds(pid: int) -> float:
+    """What a process has used of the processor; 0 where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    except (OSError, ValueError, IndexError, AttributeError):
+        return 0.0
 
 
 # --- our own z-buffer ----------------------------------------------------------------------------------------------
