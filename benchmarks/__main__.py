@@ -20,6 +20,7 @@ def benchmarks():
 
     return {
         "neighbours": neighbours.rows,
+        "baselines": neighbours.baseline_rows,
         "umeyama": geometry.umeyama_rows,
         "consensus": geometry.consensus_rows,
         "estimate": stages.rows,

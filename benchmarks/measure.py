@@ -21,8 +21,15 @@ def compile_fresh(function: Callable, *arguments) -> tuple[Callable, float, int]
     return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1
 
 
-def time_in_turns(calls: dict[str, Callable[[], Any]], repeats: int, seconds: float = 20.0) -> dict[str, list[float]]:
-    """Seconds of every call, run one after another ``repeats`` times; fewer (at least 3) once ``seconds`` are spent."""
+def time_in_turns(
+    calls: dict[str, Callable[[], Any]], repeats: int, seconds: float = 20.0, rest: float = 0.0
+) -> dict[str, list[float]]:
+    """Seconds of every call, run one after another ``repeats`` times; fewer (at least 3) once ``seconds`` are spent.
+
+    With ``rest``, each timed call follows a pause of that many seconds and untimed calls for as long. Libraries with
+    threads of their own need it: threads that have just worked go on spinning (OpenBLAS's for some 25 ms) and take the
+    cores from whoever comes next, and those that wake up share a core for about as long.
+    """
     for call in calls.values():
         jax.block_until_ready(call())
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -31,6 +38,11 @@ def time_in_turns(calls: dict[str, Callable[[], Any]], repeats: int, seconds: fl
         if turn >= 3 and time.perf_counter() - begin > seconds:
             break
         for name, call in calls.items():
+            if rest:
+                time.sleep(rest)
+                warm = time.perf_counter() + rest
+                while time.perf_counter() < warm:
+                    jax.block_until_ready(call())
             start = time.perf_counter()
             jax.block_until_ready(call())
             times[name].append(time.perf_counter() - start)

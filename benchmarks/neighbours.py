@@ -23,6 +23,8 @@ SIZES = [
 ]
 ROUNDED = {(50, 576), (25, 900)}  # views and patches at which a bf16 product's indices are compared too
 QUICK = [(20, 256, 384, "float32"), (5, 576, 384, "float32"), (5, 900, 384, "float32")]
+BASELINES = [(25, 256, 384), (400, 256, 384), (50, 576, 384), (25, 900, 384)]  # beside NumPy
+REST = 0.1  # seconds between the calls of two libraries, each with threads of its own
 ACCELERATOR = [
     (400, 256, 384, "bfloat16"),
     (400, 900, 384, "float32"),
@@ -36,7 +38,13 @@ def rows(quick: bool):
     on_cpu = jax.default_backend() == "cpu"
     for size in QUICK if quick else SIZES if on_cpu else ACCELERATOR:
         yield from measure(*size, repeats=5 if quick else 15)
-    yield from baselines(views=5 if quick else 25, patches=256, channels=384, repeats=3 if quick else 7)
+
+
+def baseline_rows(quick: bool):
+    """The kernel beside what a reader would write first, each with the machine to itself."""
+    for size in [(5, 256, 384)] if quick else BASELINES:
+        yield from baselines(*size, repeats=3 if quick else 9)
+    yield from loops(*(QUICK if quick else BASELINES)[0][:3], repeats=3 if quick else 7)
 
 
 def measure(views, patches, channels, dtype, repeats):
@@ -51,7 +59,7 @@ def measure(views, patches, channels, dtype, repeats):
     }
     if on_cpu and views * patches**2 <= 25 * 900**2:
         forms["einsum + argmax"] = partial(einsum_argmax, dtype=dtype)
-    if not on_cpu:
+    if not on_cpu and dtype == "bfloat16":
         forms["nearest (pallas)"] = partial(nearest, dtype=dtype, implementation="pallas")
     built = {name: compile_fresh(form, *arguments) for name, form in forms.items()}
     calls = {name: partial(compiled, *arguments) for name, (compiled, _, _) in built.items()}
@@ -85,40 +93,57 @@ def measure(views, patches, channels, dtype, repeats):
 
 
 def baselines(views, patches, channels, repeats):
-    """What a reader would write first, at one size; the slowest at fewer views, scaled up, and said so."""
+    """The kernel and the same in NumPy, and the product that is in each of them."""
+    arguments = problem(views, patches, channels)
+    plain = [np.asarray(x) for x in arguments]
+    kernel, *_ = compile_fresh(partial(nearest, compact=False), *arguments)
+    product, *_ = compile_fresh(partial(bare_product, dtype="float32"), *arguments)
+    calls = {
+        "nearest (xla)": lambda: kernel(*arguments),
+        "NumPy + BLAS": lambda: numpy_blas(*plain),
+        "its product alone, XLA": lambda: product(*arguments),
+        "its product alone, BLAS": lambda: [plain[0] @ template.T for template in plain[1]],
+    }
+    times = time_in_turns(calls, repeats, rest=REST)
+    base = np.median(times["nearest (xla)"])
+    for name, seconds in times.items():
+        yield {
+            "name": "neighbours, baselines",
+            "size": f"{views} × {patches}² × {channels}",
+            "dtype": "float32",
+            "implementation": name,
+            "gflop_per_s": 2 * views * patches**2 * channels / np.median(seconds) / 1e9,
+            "ratio_to_kernel": np.median(seconds) / base,
+            **summarise(seconds),
+        }
+
+
+def loops(views, patches, channels, repeats):
+    """One token after another, and the slow twin: both at few views or patches, scaled up, and said so."""
     arguments = problem(views, patches, channels)
     query, templates, query_valid, template_valid = (np.asarray(x) for x in arguments)
     kernel, *_ = compile_fresh(partial(nearest, compact=False), *arguments)
     tokens, *_ = compile_fresh(token_loop, query, templates[0])
-    calls = {
-        "nearest (xla)": lambda: kernel(*arguments),
-        "NumPy + BLAS": lambda: numpy_blas(query, templates, query_valid, template_valid),
-        "token by token, one view": lambda: tokens(query, templates[0]),
-    }
-    times = time_in_turns(calls, repeats)
+    times = time_in_turns(
+        {"kernel": lambda: kernel(*arguments), "tokens": lambda: tokens(query, templates[0])}, repeats
+    )
     few = 16
     start = time.perf_counter()
     reference.nearest(query[:few], templates[:1, :few], query_valid[:few], template_valid[:1, :few])
     twin = (time.perf_counter() - start) * views * (patches / few) ** 2
-    common = {"name": "neighbours, baselines", "size": f"{views} × {patches}² × {channels}", "dtype": "float32"}
-    base = np.median(times["nearest (xla)"])
-    for name in ("nearest (xla)", "NumPy + BLAS"):
-        yield {**common, "implementation": name, "ratio_to_kernel": np.median(times[name]) / base} | summarise(
-            times[name]
-        )
-    loop = np.median(times["token by token, one view"]) * views
-    yield {
-        **common,
-        "implementation": "cosine token by token (one view, extrapolated)",
-        "median_ms": loop * 1e3,
-        "ratio_to_kernel": loop / base,
-    }
-    yield {
-        **common,
-        "implementation": f"slow twin ({few} patches, extrapolated)",
-        "median_ms": twin * 1e3,
-        "ratio_to_kernel": twin / base,
-    }
+    loop = np.median(times["tokens"]) * views
+    for name, seconds in {
+        "cosine token by token (one view, extrapolated)": loop,
+        f"slow twin ({few} patches, extrapolated)": twin,
+    }.items():
+        yield {
+            "name": "neighbours, baselines",
+            "size": f"{views} × {patches}² × {channels}",
+            "dtype": "float32",
+            "implementation": name,
+            "median_ms": seconds * 1e3,
+            "ratio_to_kernel": seconds / np.median(times["kernel"]),
+        }
 
 
 def problem(views, patches, channels):

@@ -78,6 +78,13 @@ def test_temporary_bytes_and_turns_are_real():
     assert [len(x) for x in times.values()] == [4, 4] and min(map(min, times.values())) > 0
 
 
+def test_with_rest_calls_are_made_that_do_not_count():
+    """Threads that wake up share a core for a while: what is timed comes after."""
+    count = []
+    times = time_in_turns({"one": lambda: count.append(0)}, repeats=3, rest=0.01)
+    assert len(times["one"]) == 3 and len(count) > 1 + 2 * 3
+
+
 def test_a_quick_run_writes_its_rows(tmp_path):
     path = tmp_path / "rows.json"
     command = [sys.executable, "-m", "benchmarks", "--quick", "--only", "umeyama", "--json", str(path)]

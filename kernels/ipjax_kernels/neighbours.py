@@ -47,13 +47,15 @@ def nearest(
     fit, and a template that does not fit is taken in parts. Under ``vmap`` the queries follow one another
     and share that memory. ``dtype`` is what the features are rounded to before the product, template by template;
     sums are float32 always. ``implementation``: "xla" runs anywhere and can be exported; "pallas" is one fused kernel
-    on CUDA devices, which keeps similarities out of memory altogether, and "xla" elsewhere. ``compact`` ("xla" only)
-    multiplies the valid patches of the query and few others: one of five sizes, chosen at run time, so nothing is
-    ever left out. The templates' invalid patches are the caller's to leave out, once.
+    on Hopper GPUs (compute capability 9.0), for bfloat16, which keeps similarities out of memory altogether, and
+    "xla" on all other devices. It has been compiled for a GPU but never run on one: see kernels/README.md.
+    ``compact`` ("xla" only) multiplies the valid patches of the query and few others: one of five sizes, chosen at
+    run time, so nothing is ever left out. The templates' invalid patches are the caller's to leave out, once.
 
     No derivative flows through the similarities; take the cosine of the matched features for one.
 
-    Raises ValueError at trace time for shapes that do not fit together, or a bound below one row of similarities.
+    Raises ValueError at trace time for shapes that do not fit together, a bound below one row of similarities, or
+    "pallas" in float32.
 
     InstantPose Eq. 2-3; Goodwin et al., "Zero-Shot Category-Level Object Pose Estimation", ECCV 2022, section 3.2.
     """
@@ -73,12 +75,16 @@ def nearest(
     blocks = partial(_search_blocks, memory_bytes=memory_bytes, dtype=jnp.dtype(dtype), compact=compact)
     with jax.named_scope("nearest"):
         if implementation == "pallas":
-            from ipjax_kernels.neighbours_pallas import search  # Pallas is a heavy import that few need
+            if dtype != "bfloat16":
+                raise ValueError(f'implementation="pallas" multiplies bfloat16, not {dtype}: pass dtype="bfloat16"')
+            if _others_than_hopper():
+                found = blocks(query, templates, query_valid, template_valid)
+            else:
+                from ipjax_kernels.neighbours_mosaic import search  # Pallas is a heavy import that few need
 
-            fused = partial(search, dtype=jnp.dtype(dtype))
-            found = jax.lax.platform_dependent(
-                query, templates, query_valid, template_valid, cuda=fused, default=blocks
-            )
+                found = jax.lax.platform_dependent(
+                    query, templates, query_valid, template_valid, cuda=search, default=blocks
+                )
         elif implementation == "xla":
             found = blocks(query, templates, query_valid, template_valid)
         else:
@@ -109,6 +115,15 @@ def cycle_distance(
     back = template_to_query[query_to_template]
     distance = jnp.sqrt(jnp.sum((grid - grid[back]) ** 2, axis=-1))
     return jnp.where(query_valid & template_valid[query_to_template], distance, jnp.inf)
+
+
+def _others_than_hopper():
+    """Whether a GPU is here for which the fused kernel was not written."""
+    try:
+        devices = jax.devices("cuda")
+    except RuntimeError:  # none at all: what is traced here may be lowered for elsewhere
+        return False
+    return any(getattr(device, "compute_capability", "9.0") != "9.0" for device in devices)
 
 
 def _blank_missing(found, query_valid, template_valid):

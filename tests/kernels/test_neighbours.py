@@ -1,6 +1,10 @@
 """Nearest neighbours: golden files, the slow twin, laws, the bound on memory, the fused kernel."""
 
+import os
 import re
+import subprocess
+import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from ipjax_kernels import reference
 from ipjax_kernels.neighbours import NO_MATCH, cycle_distance, nearest
-from ipjax_kernels.neighbours_pallas import search
+from ipjax_kernels.neighbours_mosaic import search
 from jaxtyping import config as jaxtyping_config
 
 VIEWS, PATCHES, OTHERS, CHANNELS = 3, 20, 17, 8
@@ -25,14 +29,13 @@ def unchecked_shapes():
     jaxtyping_config.update("jaxtyping_disable", False)
 
 
-def lattice(seed, unique=False):
-    """Small integers: products are exact in every order of summation, and ties abound."""
+def lattice(seed, high=2, *, views=VIEWS, patches=PATCHES, others=OTHERS, channels=CHANNELS):
+    """Small integers: products are exact in every order of summation, and ties abound unless ``high`` is large."""
     rng = np.random.default_rng(seed)
-    high = 100 if unique else 2
-    query = rng.integers(-high, high + 1, (PATCHES, CHANNELS)).astype(np.float32)
-    templates = rng.integers(-high, high + 1, (VIEWS, OTHERS, CHANNELS)).astype(np.float32)
+    query = rng.integers(-high, high + 1, (patches, channels)).astype(np.float32)
+    templates = rng.integers(-high, high + 1, (views, others, channels)).astype(np.float32)
     return tuple(
-        jnp.asarray(x) for x in (query, templates, rng.random(PATCHES) < 0.7, rng.random((VIEWS, OTHERS)) < 0.7)
+        jnp.asarray(x) for x in (query, templates, rng.random(patches) < 0.7, rng.random((views, others)) < 0.7)
     )
 
 
@@ -103,9 +106,9 @@ def test_golden_views(name, shared):
     np.testing.assert_allclose(cycle, data["spec_masked_cyc_dist"].reshape(16, -1), atol=1e-6)
 
 
-@given(seed=st.integers(0, 2**31), unique=st.booleans())
-def test_twin_with_ties_and_masks(seed, unique):
-    arguments = lattice(seed, unique)
+@given(seed=st.integers(0, 2**31), high=st.sampled_from((2, 100)))
+def test_twin_with_ties_and_masks(seed, high):
+    arguments = lattice(seed, high)
     expected = reference.nearest(*arguments)
     assert_equal(nearest(*arguments), expected)
     assert_equal(nearest(*arguments, memory_bytes=SMALL), expected)
@@ -160,30 +163,125 @@ def test_nothing_valid():
     assert np.all(np.isinf(cycle))
 
 
-@given(seed=st.integers(0, 2**31))
-def test_fused_kernel_equals_twin(seed):
-    query, templates, query_valid, template_valid = lattice(seed)
-    expected = reference.nearest(query, templates, query_valid, template_valid)
-    found = FUSED(query, templates, query_valid, template_valid)
+# Two tiles each way, the last ones padded, and three pieces of 64 channels, the last one of masks and padding.
+FUSED = {"views": 2, "patches": 140, "others": 150, "channels": 127}
+
+
+def simulation():
+    """Pallas' simulation of a GPU, which also looks for races between threads and copies."""
+    try:
+        from jax.experimental.pallas.mosaic_gpu import InterpretGPUParams
+    except ImportError:  # JAX 0.10 has it under another name
+        from jax._src.pallas.mosaic_gpu.interpret.params import InterpretGPUParams
+    return InterpretGPUParams(detect_races=True)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    """The fused kernel on a simulated GPU."""
+    return jax.jit(lambda *arguments: search(*arguments, interpret=simulation()))
+
+
+@pytest.mark.parametrize(("seed", "high"), [(0, 1), (1, 1), (2, 100)])
+def test_fused_kernel_equals_twin(simulated, seed, high):
+    """With ties in plenty (small integers) and few; products of integers below 2**8 are exact in bfloat16."""
+    from jax._src.pallas.mosaic_gpu.interpret.interpret_pallas_call import get_races
+
+    query, templates, query_valid, template_valid = lattice(seed, high, **FUSED)
+    query = jnp.where(query_valid[:, None], query, jnp.nan)  # what is invalid may hold anything
+    expected = reference.nearest(jnp.nan_to_num(query), templates, query_valid, template_valid)
+    found = simulated(query, templates, query_valid, template_valid)
+    assert not get_races().races_found
     mine, theirs = np.asarray(query_valid), np.asarray(template_valid)
-    matched = mine & np.any(theirs, axis=1, keepdims=True)
     for ours, wanted in zip(found[:2], expected[:2], strict=True):
-        np.testing.assert_array_equal(np.asarray(ours)[matched], wanted[matched])
+        np.testing.assert_array_equal(np.asarray(ours)[:, mine], wanted[:, mine])
     for ours, wanted in zip(found[2:], expected[2:], strict=True):
-        if mine.any():
-            np.testing.assert_array_equal(np.asarray(ours)[theirs], wanted[theirs])
+        np.testing.assert_array_equal(np.asarray(ours)[theirs], wanted[theirs])
 
 
-FUSED = jax.jit(lambda *a: search(*a, block=16, interpret=True))  # two blocks each way, the last ones padded
+def fused_text(platform, batch=False):
+    """The lowered text of ``nearest`` with the fused kernel asked for."""
+    arguments = lattice(0)
+    function = lambda *a: nearest(*a, dtype="bfloat16", implementation="pallas")
+    if batch:
+        function = jax.vmap(function, in_axes=(0, None, 0, None))
+        arguments = [x[None] if i in (0, 2) else x for i, x in enumerate(arguments)]
+    return jax.jit(function).trace(*arguments).lower(lowering_platforms=(platform,)).as_text()
 
 
 def test_fused_kernel_lowers_for_cuda_and_falls_back():
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), lattice(0))
-    for dtype in ("float32", "bfloat16"):
-        traced = jax.jit(lambda *a, dtype=dtype: nearest(*a, dtype=dtype, implementation="pallas")).trace(*shapes)
-        assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
-        assert "triton" not in traced.lower(lowering_platforms=("cpu",)).as_text()
-    assert_equal(nearest(*lattice(1), implementation="pallas"), nearest(*lattice(1)))
+    assert "mosaic_gpu" in fused_text("cuda") and "mosaic_gpu" in fused_text("cuda", batch=True)
+    assert "mosaic_gpu" not in fused_text("cpu")
+    found = nearest(*lattice(1), dtype="bfloat16", implementation="pallas")
+    assert_equal(found, nearest(*lattice(1), dtype="bfloat16"))
+    with pytest.raises(ValueError, match='pass dtype="bfloat16"'):
+        nearest(*lattice(1), implementation="pallas")
+
+
+def test_other_gpus_than_hopper_get_the_blocked_form(monkeypatch):
+    try:
+        for capability, fused in (("8.6", False), ("9.0", True), ("12.0", False)):
+            nearest.clear_cache()  # or it is not traced again
+            device = SimpleNamespace(compute_capability=capability)
+            monkeypatch.setattr(jax, "devices", lambda *_, device=device: [device])
+            assert ("mosaic_gpu" in fused_text("cuda")) is fused
+    finally:
+        nearest.clear_cache()
+
+
+# What the compiler asks about a GPU, here an H100: so that it compiles for one that is not there.
+HOPPER = """
+gpu_device_info {
+  threads_per_block_limit: 1024  threads_per_warp: 32  core_count: 132  fpus_per_core: 128
+  shared_memory_per_block: 49152  shared_memory_per_core: 233472  shared_memory_per_block_optin: 232448
+  threads_per_core_limit: 2048  registers_per_core_limit: 65536  registers_per_block_limit: 65536
+  block_dim_limit_x: 2147483647  block_dim_limit_y: 65535  block_dim_limit_z: 65535
+  memory_bandwidth: 3352320000000  l2_cache_size: 52428800  clock_rate_ghz: 1.98  device_memory_size: 84978434048
+  cuda_compute_capability { major: 9 }
+}
+platform_name: "CUDA"
+dnn_version_info { major: 9  minor: 10 }
+device_description_str: "an H100"
+"""
+COMPILE = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+from jax.experimental import topologies
+from ipjax_kernels.neighbours_mosaic import search
+
+try:
+    jax.devices()  # registers the plugin, which finds no GPU
+except RuntimeError:
+    pass
+found = topologies.get_topology_desc(platform="cuda", topology_name="one", topology="1x1x1", target_config=sys.argv[1])
+sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(np.array(found.devices), "x"), jax.sharding.PartitionSpec())
+shape = lambda *size, dtype=jnp.float32: jax.ShapeDtypeStruct(size, dtype, sharding=sharding)
+flags = shape(900, dtype=bool), shape(8, 900, dtype=bool)
+jax.jit(search).lower(shape(900, 384), shape(8, 900, 384), *flags).compile()
+"""
+
+
+def test_fused_kernel_compiles_for_hopper():
+    """To machine code, by NVIDIA's assembler, with all similarities in registers. No GPU is needed, but the plugin."""
+    pytest.importorskip("jax_plugins.xla_cuda13", reason="pip install --no-deps jax-cuda13-plugin jax-cuda13-pjrt")
+    environment = os.environ | {"JAX_SKIP_CUDA_CONSTRAINTS_CHECK": "1", "MOSAIC_GPU_DUMP_PTXAS": "1"}
+    environment.pop("JAX_PLATFORMS", None)
+    done = subprocess.run([sys.executable, "-c", COMPILE, HOPPER], env=environment, capture_output=True, text=True)
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said
+    assert re.search("Compiling entry function '\\w+' for 'sm_90a'", said)
+    print(*re.findall(r"\d+ bytes stack frame.*|Used \d+ registers.*", said), sep="\n")
+    assert "0 bytes stack frame, 0 bytes spill stores, 0 bytes spill loads" in said
+
+
+def test_fused_kernel_on_a_device():
+    device = jax.devices()[0]
+    if device.platform != "gpu" or device.compute_capability != "9.0":
+        pytest.skip("needs a Hopper GPU, and JAX_PLATFORMS=cuda")
+    for seed, high in ((0, 1), (1, 100)):
+        arguments = lattice(seed, high, views=5, patches=900, others=900, channels=384)
+        found = nearest(*arguments, dtype="bfloat16", implementation="pallas")
+        assert_equal(found, nearest(*arguments, dtype="bfloat16"))
 
 
 @pytest.mark.parametrize(("patches", "memory_bytes"), [(256, 64 * 2**20), (900, 64 * 2**20), (900, 2**20)])
