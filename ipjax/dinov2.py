@@ -18,6 +18,8 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
+from ipjax.types import UNNAMED
+
 _MEAN = (0.485, 0.456, 0.406)  # ImageNet, RGB
 _DEVIATION = (0.229, 0.224, 0.225)
 _HIGHEST = jax.lax.Precision.HIGHEST  # float32 means float32 on every device; whoever wants speed takes bfloat16
@@ -320,7 +322,7 @@ def tokens(
 class Encoder(nnx.Module):
     """A model, the block whose patch tokens serve as features, and a name for the two. Made by ``load_encoder``."""
 
-    def __init__(self, model: DinoV2, block: int, identity: str = "unnamed"):
+    def __init__(self, model: DinoV2, block: int, identity: str = UNNAMED):
         if not 0 <= block < model.config.depth:
             raise ValueError(f"there is no block {block}: the model has {model.config.depth}")
         self.model = model

@@ -1,5 +1,6 @@
 """From a view to its patches: a feature and a 3-D point each (the paper's F, and Eq. 6 before matching)."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import point_map
 from ipjax.config import DescribeConfig
-from ipjax.types import Patches, Query, Templates, View
+from ipjax.types import UNNAMED, Patches, Query, Templates, View
 
 
 def describe(
@@ -40,7 +41,17 @@ def describe(
         points=points,
         grid=grid.reshape(-1, 2),
         valid=cover >= config.cover,
+        encoder=identity_of(encoder),
     )
+
+
+def identity_of(encoder: object) -> str | None:
+    """What tells an encoder from others: its ``identity``, or None where it has none.
+
+    Whoever writes an encoder of their own may give it one: any text that changes with its weights and settings.
+    """
+    identity = getattr(encoder, "identity", None)
+    return identity if isinstance(identity, str) and identity not in ("", UNNAMED) else None
 
 
 def observe(
@@ -72,7 +83,7 @@ def centre(
     share = patches.valid.astype(raw.dtype)[..., None]
     mean = jnp.sum(raw * share, axis=(0, 1)) / jnp.maximum(jnp.sum(share), 1)
     features, norm = centre_on(raw, mean)
-    return Patches(features.astype(patches.features.dtype), patches.points, patches.grid, patches.valid), mean, norm
+    return dataclasses.replace(patches, features=features.astype(patches.features.dtype)), mean, norm
 
 
 def principal_basis(patches: Patches, count: int) -> Float[np.ndarray, "f c"]:

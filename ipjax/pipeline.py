@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from ipjax.alignment import align
 from ipjax.confidence import covariance, find_rival, loosest_turn, pair_information, probability
 from ipjax.config import Config
-from ipjax.features import lift, object_features
+from ipjax.features import identity_of, lift, object_features
 from ipjax.matching import match, select
 from ipjax.refinement import Cloud, information, refine, settle, trace_contour
 from ipjax.scoring import score, seen_share
@@ -46,9 +46,11 @@ def estimate(
       ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera.
 
     Raises:
-      ValueError: the crop is not square, or its features are not those of the templates' encoder.
+      ValueError: the crop is not square, or the templates, the query and the encoder are not of one encoder (by the
+        length of features, and by identity where it is known: see ``features.identity_of``).
     """
     _check_shapes(templates, query)
+    _check_encoders(encoder, templates, query)
     with jax.named_scope("match"):
         matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
@@ -166,6 +168,22 @@ def _check_shapes(templates: Templates, query: Query) -> None:
         raise ValueError(
             f"the query's features have {given} channels and the templates' {wanted}: "
             "they must come from the same encoder"
+        )
+
+
+def _check_encoders(encoder: object, templates: Templates, query: Query) -> None:
+    """By identity, not by the length of features; what has no identity is not compared."""
+    found = {
+        "the object was onboarded with": templates.patches.encoder,
+        "the query was described by": query.patches.encoder,
+        "candidates would be drawn for": identity_of(encoder),
+    }
+    known = {what: identity for what, identity in found.items() if identity is not None}
+    if len(set(known.values())) > 1:
+        told = ", ".join(f"{what} '{identity}'" for what, identity in known.items())
+        raise ValueError(
+            f"{told}: features of different encoders cannot be compared; onboard the object again, or use the encoder "
+            "that it was made with"
         )
 
 

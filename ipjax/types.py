@@ -9,6 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+UNNAMED = "unnamed"  # the identity of an encoder that nobody named
+
 
 class Camera(eqx.Module):
     """A pinhole camera without distortion; the centre of the first pixel is at (0, 0), as in OpenCV and BOP."""
@@ -47,6 +49,8 @@ class Patches(eqx.Module):
     points: Float[Array, "*b p 3"]  # in the owner's frame: object (model units) or camera (metres)
     grid: Float[Array, "*b p 2"]  # (column, row), in patches
     valid: Bool[Array, "*b p"]  # on the object, with a depth
+    # Who described it: the encoder's ``identity``, its weights' hash included; None = one without, never compared.
+    encoder: str | None = eqx.field(static=True, default=None)
 
 
 class Surface(eqx.Module):

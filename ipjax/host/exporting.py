@@ -36,7 +36,7 @@ _UNITS = {
 def to_dictionary(record: Any) -> dict[str, Any]:
     """A record of ``ipjax.types`` as nested dictionaries of arrays, by field name."""
     fields = record.__dataclass_fields__
-    values = {name: getattr(record, name) for name in fields}
+    values = {name: getattr(record, name) for name, field in fields.items() if not field.metadata.get("static")}
     present = {name: x for name, x in values.items() if x is not None}
     return {name: to_dictionary(x) if hasattr(x, "__dataclass_fields__") else x for name, x in present.items()}
 
@@ -122,6 +122,7 @@ def export(
         "jax": jax.__version__,
         "platforms": list(PLATFORMS),
         "batch": batch,
+        "encoder": templates.patches.encoder,  # who must describe the queries; null = not known
         "inputs": _describe({"templates": arguments[0], "query": arguments[1], "key": arguments[2]}),
         "outputs": _describe(jax.tree.unflatten(exported.out_tree, exported.out_avals)),
         "frames": "camera_from_object: x_camera [m] = scale * rotation @ x_object [diameters] + translation",

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ipjax.host.storage import parse_json, writing
-from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates
+from ipjax.types import UNNAMED, Appearance, Camera, Patches, Similarity, Surface, Templates
 
 FORMAT = 1
 SUFFIX = ".ipjax"
@@ -338,8 +338,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
         Templates with a leading axis of the objects.
 
     Raises:
-        ValueError: there is none, or they are not alike: features of different lengths, or some of them with a basis or
-            an appearance and some without.
+        ValueError: there is none, or they are not alike: of different encoders, features of different lengths, or some
+            with a basis or an appearance and some without.
     """
     objects = list(objects)
     if not objects:
@@ -350,6 +350,10 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
             "pad_templates takes single objects whose features have one shape [views, patches, channels], not "
             + " and ".join(str(np.shape(o.patches.features)) for o in objects)
         )
+    encoders = sorted({o.patches.encoder for o in objects if o.patches.encoder is not None})
+    if len(encoders) > 1:
+        raise ValueError(f"these objects were onboarded with different encoders: {', '.join(map(repr, encoders))}")
+    objects = [dataclasses.replace(o, patches=dataclasses.replace(o.patches, encoder=None)) for o in objects]
     for name in ("basis", "appearance"):
         if len({getattr(o, name) is None for o in objects}) > 1:
             raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
@@ -357,7 +361,9 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     count = max(o.surface.points.shape[0] for o in objects)
     drawn = max(0 if o.appearance is None else o.appearance.points.shape[0] for o in objects)
     padded = [_pad(o, views, patches, count, drawn) for o in objects]
-    return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
+    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
+    patches = dataclasses.replace(stacked.patches, encoder=encoders[0] if encoders else None)
+    return dataclasses.replace(stacked, patches=patches)
 
 
 def _pad(templates: Templates, views: int, patches: int, count: int, drawn: int) -> Templates:
@@ -412,7 +418,11 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
     return (
         Templates(
             patches=Patches(
-                features=device["features"], points=device["points"], grid=device["grid"], valid=device["valid"]
+                features=device["features"],
+                points=device["points"],
+                grid=device["grid"],
+                valid=device["valid"],
+                encoder=None if info.encoder in ("", UNNAMED) else info.encoder,
             ),
             mean=device["mean"],
             norm=device["norm"],

@@ -147,7 +147,7 @@ def _describe(
     points = jnp.sum(offset[:, :, None] * camera_from_object.rotation[None], axis=1)
     squared = jnp.sum((points[:, None] - surface.points[None]) ** 2, axis=-1)
     seen = surface.seen[jnp.argmin(squared, axis=1)]
-    return Patches(patches.features.astype(jnp.float16), points, patches.grid, patches.valid), seen
+    return dataclasses.replace(patches, features=patches.features.astype(jnp.float16), points=points), seen
 
 
 _describe_view_on_one_core = jax.jit(_describe, compiler_options={"xla_cpu_multi_thread_eigen": False})
