@@ -18,7 +18,9 @@ Lengths are model units: the object's bounding box is centred at the origin and 
 
 import dataclasses
 import hashlib
+import io
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,12 +29,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ipjax.host.storage import parse_json, writing
+from ipjax.host.storage import check_budget, parse_json, read_safetensors_header, writing
 from ipjax.types import UNNAMED, Appearance, Camera, Patches, Similarity, Surface, Templates
 
 FORMAT = 1
 SUFFIX = ".ipjax"
 _PICTURE = 160  # pixels, longest side of a stored template image
+_LARGEST = 1024  # of one that is read
 
 _TEMPLATE_TENSORS = {
     "features": ("float16", "vpf"),
@@ -199,10 +202,7 @@ class ObjectInfo:
             return None
         if isinstance(self.pictures, np.ndarray):
             return self.pictures[view]
-        import cv2
-
-        image = cv2.imdecode(np.frombuffer(self.pictures[view], np.uint8), cv2.IMREAD_COLOR)
-        return None if image is None else np.ascontiguousarray(image[..., ::-1])
+        return _decode(self.pictures[view])
 
 
 def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
@@ -542,6 +542,10 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise ValueError(f"{path}: no such object file")
     types = {"F16": "float16", "F32": "float32", "BOOL": "bool", "U8": "uint8", "I32": "int32", "I64": "int64"}
     try:
+        try:
+            read_safetensors_header(path)
+        except ValueError as error:
+            raise ValueError(f"{path}: not an object file, or a damaged one ({error})") from None
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata() or {}
             if "ipjax" not in metadata:
@@ -556,6 +560,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
                 },
                 str(path),
             )
+            size = {"BOOL": 1, "U8": 1, "F16": 2, "I64": 8}
+            needed = sum(size.get(str(s.get_dtype()), 4) * math.prod(s.get_shape()) for s in slices.values())
+            check_budget(needed, f"{path}: the object")
             tensors = {name: file.get_tensor(name) for name in slices}
     except SafetensorError as error:
         raise ValueError(f"{path}: not an object file, or a damaged one ({str(error).splitlines()[0]})") from None
@@ -630,6 +637,21 @@ def _reference(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> Refere
     if told is None:
         return None
     return Reference.from_json(told, tensors["photo"].tobytes() if "photo" in tensors else None)
+
+
+def _decode(picture: bytes) -> np.ndarray | None:
+    """A JPEG as RGB; None where it is none, or promises more pixels than a picture here can have."""
+    import cv2
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(picture), formats=["JPEG"]) as image:
+            if max(image.size) > _LARGEST:
+                return None
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
+    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
+    return None if image is None else np.ascontiguousarray(image[..., ::-1])
 
 
 def _compress(pictures: Any) -> list[bytes]:

@@ -14,6 +14,10 @@ import numpy as np
 _TYPES = {1: np.float32, 6: np.int32, 7: np.int64, 9: np.bool_, 10: np.float16, 11: np.float64}  # TensorProto.DataType
 
 
+_PARTS = 100_000  # of a graph; the one that is read has some hundreds
+_INPUTS = 1000  # of an operation
+
+
 class Node(NamedTuple):
     """One operation of the graph."""
 
@@ -76,12 +80,14 @@ def _view(value: int | memoryview) -> memoryview:
 def _tensor(data: memoryview) -> tuple[str, np.ndarray]:
     name, shape, kind, raw = "", [], 0, None
     for number, value in _fields(data):
+        if len(shape) > 8:
+            raise ValueError("a tensor has more than eight sides")
         if number == 1:  # dims, one by one or packed
             if isinstance(value, int):
                 shape.append(value)
             else:
                 at = 0
-                while at < len(value):
+                while at < len(value) and len(shape) <= 8:
                     side, at = _varint(value, at)
                     shape.append(side)
         elif number == 2:
@@ -101,6 +107,8 @@ def _tensor(data: memoryview) -> tuple[str, np.ndarray]:
 def _node(data: memoryview) -> Node:
     inputs, name, operation = [], "", ""
     for number, value in _fields(data):
+        if number == 1 and len(inputs) == _INPUTS:
+            raise ValueError(f"an operation has more than {_INPUTS:,} inputs")
         if number == 1:
             inputs.append(_text(value))
         elif number == 3:
@@ -120,6 +128,8 @@ def read_onnx(path: str | Path) -> Graph:
         if len(graphs) != 1:
             raise ValueError("it holds no graph")
         for number, value in _fields(graphs[0]):
+            if len(nodes) + len(tensors) > _PARTS:
+                raise ValueError(f"it has more than {_PARTS:,} operations and constants")
             if number == 1:
                 nodes.append(_node(_view(value)))
             elif number == 5:

@@ -18,7 +18,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-_LIMIT = 64 * 2**20  # bytes of data.pkl; the largest published model's has 0.1 MB
+from ipjax.host.storage import check_tensors
+
+_LIMIT = 2**20  # bytes of data.pkl, each of which may become an object of 72; the largest published model's has 0.1 MB
 _WORDS = """
     PROTO FRAME GLOBAL STACK_GLOBAL REDUCE BUILD STOP MARK MEMOIZE BINPUT LONG_BINPUT BINGET LONG_BINGET BINPERSID
     EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST APPEND APPENDS EMPTY_DICT SETITEM SETITEMS NONE NEWTRUE NEWFALSE
@@ -44,7 +46,7 @@ class _Kind(NamedTuple):
 
 
 def _strided(storage: Any, offset: Any, shape: Any, strides: Any) -> np.ndarray:
-    """The tensor that lies in ``storage`` (flat) with these strides, copied; ValueError when it does not lie within."""
+    """The tensor that lies in ``storage`` (flat) with these strides, not copied; ValueError where it reaches beyond."""
     numbers = (offset, *shape, *strides)
     if not isinstance(storage, np.ndarray) or not all(isinstance(n, int) and n >= 0 for n in numbers):
         raise ValueError("a tensor is described by something other than sizes")
@@ -56,7 +58,7 @@ def _strided(storage: Any, offset: Any, shape: Any, strides: Any) -> np.ndarray:
     if last >= storage.size or math.prod(shape) > storage.size:
         raise ValueError("a tensor reaches beyond its storage")
     steps = [stride * storage.itemsize for stride in strides]
-    return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps).copy()
+    return np.lib.stride_tricks.as_strided(storage[offset:], shape, steps, writeable=False)
 
 
 def _unpickle(program: bytes, load: Callable[[str, np.dtype], np.ndarray]) -> Any:
@@ -96,7 +98,11 @@ def _unpickle(program: bytes, load: Callable[[str, np.dtype], np.ndarray]) -> An
 
 
 def read_pth(path: str | Path) -> dict[str, np.ndarray]:
-    """The tensors of a ``.pth`` file that holds a plain state dict; ValueError, in words, for anything else."""
+    """The tensors of a ``.pth`` file that holds a plain state dict; ValueError, in words, for anything else.
+
+    They lie where their storages do, so that many views of one cost nothing; whoever copies them is told here when
+    that would take more memory than the file could fill.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             entries = {entry.filename: entry for entry in archive.infolist()}
@@ -112,12 +118,17 @@ def read_pth(path: str | Path) -> dict[str, np.ndarray]:
             if order not in (b"little", b"big"):
                 raise ValueError("its byte order is unknown")
             storages: dict[str, np.ndarray] = {}
+            left = Path(path).stat().st_size  # entries that lie over one another would promise more
 
             def load(key: str, dtype: np.dtype) -> np.ndarray:
+                nonlocal left
                 name = f"{root}data/{key}"
                 if name not in entries:
                     raise ValueError(f"the storage {key!r} is missing")
                 if key not in storages:
+                    left -= entries[name].file_size
+                    if left < 0:
+                        raise ValueError("its storages take more bytes than the file has")
                     storages[key] = np.frombuffer(archive.read(name), np.uint8)
                 raw = storages[key]
                 if raw.size % dtype.itemsize:
@@ -136,4 +147,5 @@ def read_pth(path: str | Path) -> dict[str, np.ndarray]:
         isinstance(name, str) and isinstance(tensor, np.ndarray) for name, tensor in found.items()
     ):
         raise ValueError(f"{path} is refused: it is not a plain dictionary of tensors")
+    check_tensors(path, sum(tensor.nbytes for tensor in found.values()))
     return dict(found)

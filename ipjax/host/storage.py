@@ -18,6 +18,7 @@ from typing import Any
 _MB = 2**20
 _DEFAULT_BUDGET = 640 * _MB
 _YAML_NODES = 50_000  # PyYAML keeps about a kilobyte for each of them while it reads
+_HEADER = 8 * _MB  # of description in a safetensors file; a thousand tensors take 0.1 MB
 _DEPTH = 64  # levels of nesting; NumPy has no more axes either
 
 
@@ -51,6 +52,40 @@ def check_budget(needed: int, what: str) -> None:
             f"{what} would take {-(-needed // _MB):,} MB of memory, more than the {allowed // _MB:,} MB allowed for "
             "one file; reduce it, or set IPJAX_FILE_BUDGET (MB) if you trust it"
         )
+
+
+def check_tensors(path: str | Path, needed: int) -> None:
+    """Refuse tensors that would take more memory than their file could fill: many of them may lie in one place of it.
+
+    Files of weights may be larger than the budget of other files; what they say is true takes at most their own size,
+    and twice where two names share a tensor.
+
+    Args:
+        needed: bytes of all tensors.
+
+    Raises:
+        ValueError: too much; names the file.
+    """
+    size = Path(path).stat().st_size
+    if needed > 2 * size + _MB:
+        raise ValueError(
+            f"{path}: its tensors would take {-(-needed // _MB):,} MB of memory, but the file has only "
+            f"{-(-size // _MB):,} MB"
+        )
+
+
+def read_safetensors_header(path: str | Path) -> int:
+    """The length of the description at the head of a safetensors file, bytes, before anything parses it.
+
+    Raises:
+        ValueError: a length that the file has not, or that no honest file needs; does not name the file.
+        OSError: the file cannot be read.
+    """
+    with open(path, "rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+    if length > min(_HEADER, max(Path(path).stat().st_size - 8, 0)):
+        raise ValueError(f"it would begin with {length:,} bytes of description")
+    return length
 
 
 def read_text(path: str | Path, what: str = "file") -> str:

@@ -34,7 +34,7 @@ from flax import nnx
 
 from ipjax.dinov2 import PRESETS, DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.host.progress import bar
-from ipjax.host.storage import locked, publish, write_text
+from ipjax.host.storage import check_tensors, locked, publish, read_safetensors_header, write_text
 
 _log = logging.getLogger("ipjax.weights")
 
@@ -564,8 +564,9 @@ def read_safetensors(path: Path) -> dict[str, np.ndarray]:
     from safetensors.numpy import load_file
 
     try:
+        read_safetensors_header(path)
         return load_file(path)
-    except (SafetensorError, KeyError) as error:
+    except (SafetensorError, KeyError, ValueError) as error:
         raise ValueError(f"{path} is not a readable safetensors file ({error})") from None
 
 
@@ -622,7 +623,9 @@ def read_weights(path: str | Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise WeightsError(f"there is no weights file at {path}")
     try:
-        return rename(READERS[path.suffix](path))
+        tensors = READERS[path.suffix](path)
+        check_tensors(path, sum(tensor.nbytes for tensor in tensors.values()))
+        return rename(tensors)
     except WeightsError:
         raise
     except (ValueError, OSError) as error:
