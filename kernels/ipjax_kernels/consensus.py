@@ -210,20 +210,20 @@ def consensus(
     lower, upper = (jnp.asarray(bound, source.dtype) for bound in scale_bounds)
     threshold = jnp.asarray(threshold, source.dtype)
 
-    def rate(scores, scale, limit, allowed):
+    def rate(scores, scale, allowed):
         truncated, inside, loss = scores
         allowed = allowed & (scale >= lower) & (scale <= upper)
         first = truncated if rank == "msac" else inside
         second = jnp.zeros_like(loss) if rank == "msac" else loss
-        return jnp.where(allowed, first, -1), jnp.where(allowed, second, jnp.inf), limit, allowed
+        return jnp.where(allowed, first, -1), jnp.where(allowed, second, jnp.inf), allowed
 
     def limit_of(scale):
         return threshold * scale if relative else jnp.broadcast_to(threshold, scale.shape)
 
-    def judge(rotation, translation, scale, allowed):
+    def judge(rotation, translation, scale):
         limit = limit_of(scale)
         squared = residuals(rotation, translation, scale, source, target)
-        return rate(score_sets(squared, weight, limit), scale, limit, allowed)
+        return squared, limit, squared < jnp.square(limit)[:, None]
 
     with jax.named_scope("fit"):
         chosen_source = jnp.moveaxis(source.T[:, table.T], 0, 1)  # (m, 3, n): the batch axis last
@@ -237,23 +237,25 @@ def consensus(
     with jax.named_scope("judge"):
         limit = limit_of(scale)
         scores = score_batch_last(rotation, translation, scale, source, target, weight, limit)
-        score, loss, _, success = rate(scores, scale, limit, success)
+        score, loss, success = rate(scores, scale, success)
         # A full sort costs six times as much; only "count" needs its second key.
         order = jax.lax.top_k(score, keep)[1] if rank == "msac" else _order(score, loss)[:keep]
         rotation, translation = jnp.moveaxis(rotation[..., order], -1, 0), jnp.moveaxis(translation[..., order], -1, 0)
-        best = (rotation, translation, scale[order], score[order], loss[order], success[order])
+        inliers = judge(rotation, translation, scale[order])[2]
+        best = (rotation, translation, scale[order], score[order], loss[order], inliers)
+        success = success[order]
 
     def refit(_, best):
-        rotation, translation, scale, score, loss, success = best
-        _, _, limit, _ = judge(rotation, translation, scale, success)
-        inliers = residuals(rotation, translation, scale, source, target) < jnp.square(limit)[:, None]
+        score, loss, inliers = best[3:]
         fitted = fit_batch_last(source[:, :, None], target[:, :, None], jnp.where(inliers, weight, 0).T)
         rotation, translation = jnp.moveaxis(fitted[0], -1, 0), jnp.moveaxis(fitted[1], -1, 0)
-        new_score, new_loss, _, allowed = judge(rotation, translation, fitted[2], fitted[4] & success)
+        squared, limit, inliers = judge(rotation, translation, fitted[2])
+        scores = score_sets(squared, weight, limit)
+        new_score, new_loss, allowed = rate(scores, fitted[2], fitted[4] & success)
         # Sums of the same weights in another order may differ in the last digit; the loss decides then.
         tied = jnp.abs(new_score - score) <= 8 * jnp.finfo(score.dtype).eps
         better = allowed & jnp.where(tied, new_loss < loss, new_score > score)
-        new = (rotation, translation, fitted[2], new_score, new_loss, success)
+        new = (rotation, translation, fitted[2], new_score, new_loss, inliers)
         return tuple(
             jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), fresh, old)
             for old, fresh in zip(best, new, strict=True)
@@ -262,9 +264,8 @@ def consensus(
     with jax.named_scope("refit"):
         best = jax.lax.fori_loop(0, refits, refit, best)
     order = _order(best[3], best[4])
-    rotation, translation, scale, score, loss, success = (field[order] for field in best)
-    _, _, limit, _ = judge(rotation, translation, scale, success)
-    inliers = residuals(rotation, translation, scale, source, target) < jnp.square(limit)[:, None]
+    rotation, translation, scale, score, _, inliers = (field[order] for field in best)
+    success = success[order]
     inliers = inliers & present & success[:, None]
     return Hypotheses(rotation, translation, scale, score, inliers, success)
 
