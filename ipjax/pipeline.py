@@ -227,7 +227,7 @@ def _rounds(
     count = first.score.shape[0]
     turned = min(config.score.alternates, count)
 
-    def one_round(given, _):
+    def one_round(given, last):
         poses, determined = given
         if config.refine.steps:
             with jax.named_scope("refine"):
@@ -237,17 +237,22 @@ def _rounds(
         found = _Candidates(poses, determined, jnp.where(determined, rated, -1), agreement)
         if not turned:
             return given, found
+        # Nobody refines what the last round would turn.
+        return lax.cond(last, lambda _: given, turn_best, found), found
+
+    def turn_best(found):
         best = lax.top_k(found.score, turned)[1]
-        again = lambda x: jnp.repeat(x[best], TURNS, axis=0)
-        alternates = turn(jax.tree.map(lambda x: x[best], poses), templates.axes)
+        determined = jnp.repeat(found.determined[best], TURNS)
+        alternates = turn(jax.tree.map(lambda x: x[best], found.poses), templates.axes)
         # Most turns explain little, which shows before they are refined.
-        promise = jnp.where(again(determined), _rate(templates, query, scene, alternates, config)[0], -1)
+        promise = jnp.where(determined, _rate(templates, query, scene, alternates, config)[0], -1)
         chosen = lax.top_k(promise, min(count, TURNS * turned))[1]
         there = jnp.arange(count) < chosen.shape[0]  # what fills the round up is no hypothesis of its own
         pick = lambda x: jnp.resize(x[chosen], (count, *x.shape[1:]))
-        return (jax.tree.map(pick, alternates), pick(again(determined)) & there), found
+        return jax.tree.map(pick, alternates), pick(determined) & there
 
-    _, found = lax.scan(one_round, (first.poses, first.determined), None, length=2 if turned else 1)
+    rounds = jnp.array([False, True] if turned else [True])
+    _, found = lax.scan(one_round, (first.poses, first.determined), rounds)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
 
