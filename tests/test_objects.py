@@ -31,6 +31,7 @@ def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templ
             points=normal(views, patches, 3),
             grid=normal(views, patches, 2),
             valid=jnp.asarray(rng.random((views, patches)) < 0.7).at[0, 0].set(True),
+            encoder="dinov2 vits14 block=8",
         ),
         mean=normal(channels),
         norm=normal(views, patches),
