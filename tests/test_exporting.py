@@ -3,6 +3,8 @@
 import json
 import subprocess
 import sys
+from datetime import UTC, datetime, timedelta
+from importlib.metadata import version
 
 import jax
 import numpy as np
@@ -57,6 +59,16 @@ def test_the_artifact_runs_without_ipjax(templates, tmp_path):
     description = json.loads((tmp_path / "estimate.stablehlo.json").read_text())
     assert description["inputs"]["templates.patches.features"]["shape"] == [8, 64, 32]
     assert description["outputs"]["camera_from_object.rotation"]["shape"] == [3, 3]
+    # Who finds a file that is refused reads here by whom it was written, and when.
+    versions = description["versions"]
+    assert {name: versions[name] for name in ("ipjax", "jax", "jaxlib")} == {
+        name: version(name) for name in ("ipjax", "jax", "jaxlib")
+    }
+    loaded = jax.export.deserialize(bytearray(path.read_bytes()))
+    assert versions["calling_convention"] == loaded.calling_convention_version
+    age = datetime.now(UTC) - datetime.fromisoformat(description["date"])
+    assert timedelta(0) <= age < timedelta(hours=1)
+    assert "six months" in description["readable"] and "three weeks" in description["readable"]
 
 
 def test_a_batch_has_its_axis_on_queries_only(templates, tmp_path):

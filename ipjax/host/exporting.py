@@ -5,21 +5,29 @@ object of the same shapes. The configuration is baked in.
 """
 
 import json
+import platform
+from datetime import UTC, datetime
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxlib
 import numpy as np
 from jaxtyping import Array
 
+from ipjax import __version__
 from ipjax.config import Config
 from ipjax.host.storage import write_bytes, write_text
 from ipjax.pipeline import estimate
 from ipjax.types import Camera, Patches, Query, Similarity, Surface, Templates, View
 
 PLATFORMS = ("cpu", "cuda", "tpu")
+PROMISE = (
+    "by a jaxlib built up to six months after the one that wrote the file, or up to three weeks before it: what "
+    "jax.export promises. What is older may be refused: export it again"
+)
 
 _UNITS = {
     "templates.patches.points": "model units (diameters), object frame",
@@ -119,7 +127,15 @@ def export(
     write_bytes(path, bytes(exported.serialize()))
     description = {
         "what": "ipjax.estimate as StableHLO: jax.export.deserialize(open(...).read()).call(templates, query, key)",
-        "jax": jax.__version__,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {
+            "ipjax": __version__,
+            "jax": jax.__version__,
+            "jaxlib": jaxlib.__version__,
+            "python": platform.python_version(),
+            "calling_convention": exported.calling_convention_version,
+        },
+        "readable": PROMISE,
         "platforms": list(PLATFORMS),
         "batch": batch,
         "encoder": templates.patches.encoder,  # who must describe the queries; null = not known
