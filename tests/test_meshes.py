@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from ipjax.host import farthest
+from ipjax.host.farthest import largest_distance
 from ipjax.host.meshes import (
     clean,
     diameter,
@@ -183,6 +185,53 @@ def test_diameter_of_flat_and_thin_meshes():
     assert diameter(make_mesh(square, np.array([[0, 1, 2], [0, 2, 3]]))) == 5
     line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]])
     assert diameter(make_mesh(line, np.array([[0, 1, 2]]))) == 2
+
+
+BODIES = {
+    "sphere": lambda d: d,
+    "long": lambda d: d * [1, 0.8, 0.5],
+    "disc": lambda d: d * [1, 1, 0.4],
+    "rough": lambda d: d * (1 + 1e-3 * np.sin(40 * d[:, :1]) * np.cos(37 * d[:, 1:2])),
+    "dome": lambda d: np.abs(d),
+    # As wide everywhere as the ball that touches it is far: every point has a partner nearly as far as the farthest.
+    "constant width": lambda d: (
+        d
+        * np.min(
+            [
+                d @ v + np.sqrt((d @ v) ** 2 - v @ v + 1)
+                for v in np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / 8**0.5
+            ],
+            axis=0,
+        )[:, None]
+    ),
+    "cube": lambda d: np.clip(2 * d, -1, 1),
+    "circle": lambda d: d / np.linalg.norm(d[:, :2], axis=1, keepdims=True) * [1, 1, 0],
+}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_the_farthest_two_points_are_those_of_all_pairs(body):
+    random = np.random.default_rng(5)
+    for count, stretch in ((2, 1), (3, 1), (60, 1e-6), (700, 1e5), (2000, 1)):
+        d = random.normal(size=(count, 3))
+        points = BODIES[body](d / np.linalg.norm(d, axis=1, keepdims=True)) * stretch + random.normal(size=3) * stretch
+        slow = max(np.linalg.norm(points - point, axis=1).max() for point in points)
+        np.testing.assert_allclose(largest_distance(points), slow, rtol=2e-9)
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_the_farthest_two_of_many_points_take_few_comparisons(body, monkeypatch):
+    """How many pairs are compared, which is what time and memory are: far fewer than all."""
+    compared = []
+    real = np.matmul
+    monkeypatch.setattr(
+        farthest, "_multiply", lambda a, b: compared.append(a.shape[0] * a.shape[1] * b.shape[2]) or real(a, b)
+    )
+    d = np.random.default_rng(6).normal(size=(20_000, 3))
+    points = BODIES[body](d / np.linalg.norm(d, axis=1, keepdims=True))
+    found = largest_distance(points)
+    assert found > 0 and sum(compared) < 0.15 * len(points) ** 2 / 2
+    assert max(compared, default=0) <= farthest.PAIRS
 
 
 def test_clean_repairs_and_says_so():

@@ -22,6 +22,8 @@ from ipjax.host.viewpoints import viewpoints
 from ipjax.host.weights import hash_file, load_encoder
 from ipjax.types import Appearance, Camera, Patches, Similarity, Surface, Templates, View
 
+_CORNERS = 3000  # of a convex hull, among which its smallest box is sought
+
 
 def framing_cameras(
     vertices: Float[np.ndarray, "n 3"], camera_from_object: Similarity, resolution: int, fill: float
@@ -47,11 +49,33 @@ def framing_cameras(
 
 
 def box_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
-    """The axes (rows, a rotation) of the smallest box around the points: what a box or a can turns or flips about."""
-    import trimesh
+    """The axes (rows, a rotation) of the smallest box around the points: what a box or a can turns or flips about.
 
+    Raises ValueError where all points lie on a line (within a thousandth of its length), which has no such box.
+    """
+    import trimesh
+    from scipy.spatial import ConvexHull, QhullError
+
+    spread = points - points.mean(0)
+    directions = np.linalg.eigh(spread.T @ spread)[1]
+    length, width = np.sort(np.ptp(spread @ directions, axis=0))[:0:-1]
+    if width < 1e-3 * length:
+        raise ValueError("all vertices of the mesh lie on a line: it has no shape that could be found in an image")
     # To a ten-thousandth: the search is discontinuous, and its last digits would otherwise decide between equal boxes.
-    box_from_points, _ = trimesh.bounds.oriented_bounds(np.round(points, 4))
+    points = np.round(points, 4)
+    try:
+        corners = ConvexHull(points).vertices
+    except QhullError:  # flat
+        corners = np.arange(len(points))
+    if len(corners) > _CORNERS:
+        # A smooth surface is nothing but corners, and the search looks at all of them from every side.
+        points = points[corners]
+        index = np.arange(_CORNERS)
+        height, angle = 1 - (2 * index + 1) / _CORNERS, np.pi * (1 + 5**0.5) * index
+        around = np.sqrt(1 - height**2)
+        sphere = np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=-1)
+        points = points[np.unique([int((points @ direction).argmax()) for direction in sphere])]
+    box_from_points, _ = trimesh.bounds.oriented_bounds(points)
     axes = box_from_points[:3, :3]
     return axes * np.sign(np.linalg.det(axes))
 
@@ -85,6 +109,9 @@ def make_templates(
     if config.channels:
         image = jax.ShapeDtypeStruct((config.resolution, config.resolution, 3), jnp.float32)
         check_cut(jax.eval_shape(encoder, image).shape[-1], config.channels)
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    axes = box_axes(mesh.vertices[used])  # first: it refuses what has no shape
     poses = viewpoints(config.directions, config.rolls, distance=config.distance)
     cameras = framing_cameras(mesh.vertices, poses, config.resolution, config.fill)
     views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)
@@ -131,7 +158,7 @@ def make_templates(
         camera=cameras,
         surface=surface,
         extents=jnp.asarray(np.ptp(mesh.vertices, axis=0), jnp.float32),
-        axes=jnp.asarray(box_axes(mesh.vertices[np.unique(mesh.faces)]), jnp.float32),
+        axes=jnp.asarray(axes, jnp.float32),
         appearance=make_appearance(mesh, config.appearance) if config.appearance else None,
     )
     return templates, views.rgb

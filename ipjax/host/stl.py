@@ -1,0 +1,47 @@
+"""STL, binary and text in either case."""
+
+import re
+import struct
+
+import numpy as np
+
+from ipjax.host.parts import Part, Source
+
+NUMBER = rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?|[+-]?nan|[+-]?inf"
+VERTEX = re.compile(rb"\bvertex\s+(%s)\s+(%s)\s+(%s)" % (NUMBER, NUMBER, NUMBER), re.IGNORECASE)
+RECORD = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def read_stl(source: Source) -> list[Part]:
+    """One part without colour, three vertices a face. Raises ValueError in a sentence."""
+    data = source.read()
+    count = struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
+    # Binary files may begin with "solid" too: then their length tells.
+    if len(data) != 84 + 50 * count and data[:512].lstrip()[:5].lower() == b"solid":
+        if not re.search(rb"\bfacet\b", data[:65536], re.IGNORECASE):
+            raise ValueError("the mesh is empty: it has no facet")
+        source.take(len(data), "its text")
+        values = []
+        found: list[tuple[bytes, ...]] = []
+        for match in VERTEX.finditer(data):
+            found.append(match.groups())
+            if len(found) == 100_000:
+                values.append(np.array(found).astype(np.float64))
+                found = []
+                source.take(100_000 * 240, "its vertices")
+        if found:
+            values.append(np.array(found).astype(np.float64))
+        vertices = np.concatenate(values) if values else np.empty((0, 3))
+        source.take_mesh(0, len(vertices) // 3)
+        if len(vertices) == 0 or len(vertices) % 3:
+            raise ValueError(f"has {len(vertices)} vertices, which are not three a face")
+    else:
+        if count < 0:
+            raise ValueError("is too short for STL")
+        if 84 + 50 * count > len(data):
+            raise ValueError(f"promises {count} faces in {len(data)} bytes")
+        if count == 0:
+            raise ValueError("the mesh is empty: it has no faces")
+        source.take_mesh(3 * count, count)
+        vertices = np.frombuffer(data, RECORD, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
+    return [Part(vertices, np.arange(len(vertices)).reshape(-1, 3))]
