@@ -98,7 +98,8 @@ def _depth(path: Path) -> str:
         depth_scale=1.0 if depth.dtype.kind == "f" else 1e-3,
     )
     farthest = float(np.asarray(again.depth).max())
-    return f"{depth.dtype.str}: crop from {known.min():.3f} to {known.max():.3f} m; the array as NumPy loads it {farthest:.3f} m"
+    span = f"{known.min():.3f} to {known.max():.3f} m"
+    return f"{depth.dtype.str}: crop from {span}; the array as NumPy loads it {farthest:.3f} m"
 
 
 if __name__ == "__main__":

@@ -7,8 +7,10 @@ why. ``IPJAX_DEBUG=1`` shows the traceback.
 import argparse
 import logging
 import os
+import re
 import sys
 import time
+import traceback
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -39,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of a pipe has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (ValueError, OSError, MemoryError, RuntimeError) as error:
+    except (ValueError, OSError, MemoryError, RuntimeError, AssertionError) as error:
         if debug or not _is_told(error):
             raise
         print(f"ipjax: {_in_one_line(error)}", file=sys.stderr)
@@ -51,12 +53,28 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _is_told(error: BaseException) -> bool:
     """Whether the message is meant for the user; a RuntimeError is only where no renderer works or memory ends."""
-    if not isinstance(error, RuntimeError):
+    if not isinstance(error, RuntimeError | AssertionError):
         return True
-    return any(kind.__name__ == "RenderError" for kind in type(error).__mro__) or "RESOURCE_EXHAUSTED" in str(error)
+    return (
+        any(kind.__name__ == "RenderError" for kind in type(error).__mro__)
+        or "RESOURCE_EXHAUSTED" in str(error)
+        or _lacks_backend(error)
+    )
+
+
+def _lacks_backend(error: BaseException) -> bool:
+    """Whether JAX has none of the devices that JAX_PLATFORMS asks for; it says so, or asserts that it has."""
+    if "Unable to initialize backend" in str(error):
+        return True
+    frames = traceback.extract_tb(error.__traceback__)
+    return isinstance(error, AssertionError) and bool(frames) and frames[-1].filename.endswith("xla_bridge.py")
 
 
 def _in_one_line(error: BaseException) -> str:
+    if isinstance(error, RuntimeError | AssertionError) and _lacks_backend(error):
+        from ipjax.host.doctor import NO_DEVICE
+
+        return NO_DEVICE.format(os.environ.get("JAX_PLATFORMS", ""))
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, MemoryError):
@@ -69,14 +87,22 @@ class _Notes(logging.Handler):
 
     def __init__(self):
         super().__init__()
-        self.lines: list[str] = []
+        self.lines: list[str] = []  # not told yet
+        self.warnings: list[str] = []  # all of them, also those that were told
+        self.known: set[str] = set()
         self.at_once = False  # warnings, where they explain why it takes long
 
     def emit(self, record: logging.LogRecord) -> None:
+        line = record.getMessage()
+        if record.levelno >= logging.WARNING:
+            self.warnings.append(line)
+        if line in self.known:  # of many frames that are all alike, one says it
+            return
+        self.known.add(line)
         if self.at_once and record.levelno >= logging.WARNING:
-            print(record.getMessage(), file=sys.stderr, flush=True)
+            print(line, file=sys.stderr, flush=True)
         else:
-            self.lines.append(record.getMessage())
+            self.lines.append(line)
 
     def tell(self) -> None:
         """Print what was kept."""
@@ -172,6 +198,7 @@ inflated, or its depth completed. The report shows what was seen and what was gu
     parser.add_argument("--quiet", action="store_true", help="no progress bars, no notes")
     photo = parser.add_argument_group("photos")
     photo.add_argument("--mask", type=Path, metavar="FILE", help="the object (default: transparency, plain background)")
+    photo.add_argument("--mask-label", type=int, metavar="N", help="which of the numbers in a mask of several objects")
     photo.add_argument("--box", type=_box, metavar="X,Y,W,H", help="cut the object out inside this box, pixels")
     photo.add_argument("--click", type=_numbers, metavar="X,Y", help="cut out the object at this pixel")
     photo.add_argument("--depth", type=Path, metavar="FILE", help="depth aligned to the photo: metric front and size")
@@ -184,7 +211,19 @@ inflated, or its depth completed. The report shows what was seen and what was gu
 
 
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
-_PHOTO_ONLY = ("mask", "box", "click", "depth", "camera", "image", "depth_scale", "lrm", "lrm_weights", "save_mesh")
+_PHOTO_ONLY = (
+    "mask",
+    "mask_label",
+    "box",
+    "click",
+    "depth",
+    "camera",
+    "image",
+    "depth_scale",
+    "lrm",
+    "lrm_weights",
+    "save_mesh",
+)
 
 
 def _onboard(arguments: argparse.Namespace) -> int:
@@ -219,6 +258,12 @@ def _onboard(arguments: argparse.Namespace) -> int:
 
         given = {name: getattr(arguments, name) for name in ("mask", "box", "click", "depth", "depth_scale")}
         given["camera"] = _read_photo_camera(arguments)
+        if arguments.mask_label is not None:
+            if arguments.mask is None:
+                raise ValueError("--mask-label belongs to --mask")
+            from ipjax.host.images import read_mask
+
+            given["mask"] = read_mask(arguments.mask, arguments.mask_label)
         given["tried"] = output.with_suffix(".tried.png")
         take_shot(source, **given)  # a bad photo is refused before weights are loaded and anything is compiled
         encoder = _load_encoder(arguments)
@@ -266,7 +311,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
 def _read_photo_camera(arguments: argparse.Namespace) -> Any:
     if arguments.camera is None:
         return None
-    from ipjax.host.images import read_camera
+    from ipjax.host.camera_files import read_camera
 
     image = arguments.image
     if image is None and arguments.source.stem.isdigit():
@@ -293,7 +338,8 @@ examples:
 
 A folder of frames holds rgb/ and depth/ with one file of the same name per frame, mask/ (or masks/, mask_visib/) with
 NAME.png for one object or NAME_000000.png, NAME_000001.png … for several, and a camera file: scene_camera.json (BOP),
-camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine numbers).
+camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine numbers). In a scene of BOP, scene_gt.json
+says which of the masks is of which object: obj_000005.ipjax is its object 5, for other names --obj-id says it.
 
 Depth of whole numbers needs a unit: --depth-scale 0.001 for millimetres, unless the camera file has BOP's depth_scale.
 The pose in the JSON maps the coordinates of your mesh file to camera metres; every frame and unit is named there.
@@ -306,8 +352,29 @@ measured is kept; --size says another, --free-size lets it be found.
     parser.add_argument("--depth", type=Path, metavar="FILE", help="depth aligned to it: 16-bit PNG, TIFF or npy")
     parser.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
     parser.add_argument("--mask", type=Path, metavar="FILE", action="append", help="the object's visible pixels")
+    parser.add_argument(
+        "--mask-label",
+        type=int,
+        metavar="N",
+        action="append",
+        help="which of the numbers in a mask of several objects; one for each object",
+    )
     parser.add_argument("--box", type=_box, metavar="X,Y,W,H", action="append", help="instead of a mask, pixels")
     parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
+    parser.add_argument(
+        "--instance",
+        type=int,
+        metavar="N",
+        action="append",
+        help="with --frames: the mask NAME_00000N.png is the object's; one for each object",
+    )
+    parser.add_argument(
+        "--obj-id",
+        type=int,
+        metavar="N",
+        action="append",
+        help="with --frames and a scene_gt.json: which object of it; one for each object (default: from its name)",
+    )
     parser.add_argument("--image", type=int, metavar="ID", help="which image of a BOP scene_camera.json")
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
     size = parser.add_mutually_exclusive_group()
@@ -325,6 +392,9 @@ measured is kept; --size says another, --free-size lets it be found.
 
 def _estimate(arguments: argparse.Namespace) -> int:
     frames = _list_frames(arguments)
+    for name in ("mask_label", "instance", "obj_id"):
+        if len(getattr(arguments, name) or ()) not in (0, len(arguments.objects)):
+            raise ValueError(f"--{name.replace('_', '-')} is given once for each object, in their order")
     many = arguments.frames is not None
     if arguments.output is not None:
         _check_output(arguments.output, (".json",))
@@ -360,6 +430,8 @@ def _estimate(arguments: argparse.Namespace) -> int:
                 crop=arguments.crop,
             )
     objects = [load(path) for path in arguments.objects]
+    if many:
+        _choose_masks(frames, [info.name for _, info in objects], arguments)
     encoder = _matching_encoder(arguments, [info.encoder for _, info in objects])
     for path, (_, info) in zip(arguments.objects, objects, strict=True):
         _check_encoder(path, info.encoder, encoder)
@@ -379,6 +451,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
     ]
     told, failed = [], 0
     for names in frames:
+        told_before = len(arguments.notes.warnings)
         try:
             inputs = first if first is not None else _read_frame(names, arguments)
             crops, results = [], []
@@ -390,6 +463,8 @@ def _estimate(arguments: argparse.Namespace) -> int:
                 crops.append((crop, time.perf_counter() - start))
             for i, (crop, seconds) in enumerate(crops):
                 result = estimator.run(i, *crop, seed=arguments.seed, diameter=diameters[i])
+                for line in result.warnings:
+                    arguments.notes.emit(logging.makeLogRecord({"msg": line, "levelno": logging.WARNING}))
                 results.append((result, {"frame": seconds} | result.seconds))
         except (ValueError, OSError) as error:
             if not many:
@@ -403,12 +478,15 @@ def _estimate(arguments: argparse.Namespace) -> int:
             "frame": names["name"],
             "rgb": str(names["rgb"]),
             "read_seconds": inputs["seconds"],
+            "warnings": list(dict.fromkeys(arguments.notes.warnings[told_before:])),
             "objects": [
-                {"object_file": str(path)}
+                {"object_file": str(path), "mask": None if mask is None else str(mask)}
                 | tell_estimate(result.estimate, result.templates, result.info)
                 | {"size_given_mm": None if diameter is None else 1e3 * diameter}
                 | {"stage_seconds": {name: round(value, 6) for name, value in seconds.items()}}
-                for path, diameter, (result, seconds) in zip(arguments.objects, diameters, results, strict=True)
+                for path, mask, diameter, (result, seconds) in zip(
+                    arguments.objects, names["masks"], diameters, results, strict=True
+                )
             ],
         }
         if arguments.overlay is not None:
@@ -429,6 +507,8 @@ def _estimate(arguments: argparse.Namespace) -> int:
             entry["overlay"] = str(target)
             entry["draw_seconds"] = round(time.perf_counter() - start, 6)
         told.append(entry)
+        if not arguments.quiet:
+            arguments.notes.tell()
         if not arguments.quiet and arguments.output is not None:
             for one in entry["objects"]:
                 print(_summary(entry["frame"], one))
@@ -504,33 +584,123 @@ def _list_frames(arguments: argparse.Namespace) -> list[dict[str, Any]]:
         camera = next((str(folder / name) for name in names if (folder / name).is_file()), None)
         if camera is None:
             raise ValueError(f"{folder}: no camera file in it ({', '.join(names)}); give --camera")
-    masks = next((folder / n for n in ("mask", "masks", "mask_visib") if (folder / n).is_dir()), None)
-    if masks is None:
+    if _mask_folder(folder) is None:
         raise ValueError(f"{folder}: no masks in mask/, masks/ or mask_visib/")
     frames = []
     for path in found:
         depths = [folder / "depth" / f"{path.stem}{suffix}" for suffix in _DEPTHS]
-        chosen = []
-        for i in range(count):
-            names = [masks / f"{path.stem}_{i:06d}.png", *([masks / f"{path.stem}.png"] if count == 1 else [])]
-            chosen.append(next((p for p in names if p.is_file()), names[-1]))
         frames.append(
             {
                 "name": path.stem,
                 "rgb": path,
                 "depth": next((p for p in depths if p.is_file()), depths[0]),
                 "camera": camera,
-                "masks": chosen,
+                "masks": [None] * count,
                 "boxes": [None] * count,
             }
         )
     return frames
 
 
-def _read_frame(names: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    from ipjax.host.images import read_camera, read_depth, read_mask, read_rgb
+def _mask_folder(folder: Path) -> Path | None:
+    # BOP's mask/ holds whole silhouettes, and what hides a part of the object is in front of it.
+    names = ("mask_visib", "mask", "masks") if (folder / "scene_gt.json").is_file() else ("mask", "masks", "mask_visib")
+    return next((folder / name for name in names if (folder / name).is_dir()), None)
 
+
+def _choose_masks(frames: list[dict[str, Any]], names: list[str], arguments: argparse.Namespace) -> None:
+    """Fill in the masks of a folder's frames; what is wrong with one of them stands there as "error".
+
+    Raises ValueError where nothing says which mask is of which object.
+    """
+    from ipjax.host.storage import read_json
+
+    folder, count = arguments.frames, len(names)
+    masks = _mask_folder(folder)
+    assert masks is not None
+    truth = folder / "scene_gt.json"
+    scene = read_json(truth) if truth.is_file() and not arguments.instance else None
+    shares = read_json(folder / "scene_gt_info.json") if (folder / "scene_gt_info.json").is_file() else {}
+    ids = arguments.obj_id
+    if scene is None and ids:
+        raise ValueError(f"{folder}: --obj-id needs a scene_gt.json, and no --instance")
+    for frame in frames:
+        stem = frame["name"]
+        plain = masks / f"{stem}.png"
+        numbered = sorted(p for p in masks.glob(f"{stem}_*.png") if p.stem[len(stem) + 1 :].isdigit())
+        if arguments.instance:
+            frame["masks"] = [masks / f"{stem}_{number:06d}.png" for number in arguments.instance]
+        elif plain.is_file() and (count == 1 or arguments.mask_label):
+            frame["masks"] = [plain] * count
+        elif scene is not None and numbered:
+            if ids is None:
+                ids = _object_ids(names, scene, truth)
+            try:
+                chosen = [_instance(scene, shares, stem, number, truth) for number in ids]
+                frame["masks"] = [masks / f"{stem}_{number:06d}.png" for number in chosen]
+            except ValueError as error:
+                frame["error"] = str(error)
+        elif len(numbered) > count:
+            raise ValueError(
+                f"{masks}: {stem} has {len(numbered)} masks, and {count} object{'s are' if count > 1 else ' is'} "
+                "wanted: say which mask is whose with --instance N, the number in its name, once for each object"
+            )
+        else:
+            expected = [masks / f"{stem}_{i:06d}.png" for i in range(count)]
+            frame["masks"] = expected if count > 1 or expected[0].is_file() else [plain]
+
+
+def _object_ids(names: list[str], scene: Any, path: Path) -> list[int]:
+    """The numbers in scene_gt.json of objects that are named as BOP names their files."""
+    found = []
+    for name in names:
+        match = re.fullmatch(r"obj_?(\d+)", name)
+        if match is None:
+            try:
+                there = sorted({int(item["obj_id"]) for items in scene.values() for item in items})
+            except (AttributeError, KeyError, TypeError, ValueError):
+                raise ValueError(f"{path}: for each image, a list of instances with obj_id is expected") from None
+            raise ValueError(
+                f"{path}: it has the objects {', '.join(map(str, there))}: say with --obj-id which is {name}, or with "
+                "--instance which mask, once for each object"
+            )
+        found.append(int(match[1]))
+    return found
+
+
+def _instance(scene: Any, shares: Any, stem: str, number: int, path: Path) -> int:
+    """The mask of an object in an image: of its instance, or of the most visible of several."""
+    try:
+        image = str(int(stem))
+        items = [int(item["obj_id"]) for item in scene.get(image, [])]
+        about = shares.get(image, [])
+        visible = [float(item.get("visib_fract", 0)) for item in about] if len(about) == len(items) else None
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise ValueError(f"{path}: image {stem}: a list of instances with obj_id is expected") from None
+    found = [i for i, obj_id in enumerate(items) if obj_id == number]
+    if not found:
+        raise ValueError(f"{path}: there is no object {number} in image {stem}")
+    if len(found) == 1:
+        return found[0]
+    if visible is None:
+        raise ValueError(
+            f"{path}: there are {len(found)} of object {number} in image {stem}: say which with --instance"
+        )
+    best = max(found, key=lambda i: visible[i])
+    logging.getLogger("ipjax").warning(
+        "image %s: of %d of object %d, the most visible is taken (mask %06d)", stem, len(found), number, best
+    )
+    return best
+
+
+def _read_frame(names: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
+    from ipjax.host.camera_files import read_camera
+    from ipjax.host.images import read_depth, read_mask, read_rgb
+
+    if "error" in names:
+        raise ValueError(names["error"])
     start = time.perf_counter()
+    labels = arguments.mask_label or [None] * len(names["masks"])
     image = arguments.image
     if image is None and names["name"].isdigit():
         image = int(names["name"])
@@ -538,7 +708,9 @@ def _read_frame(names: dict[str, Any], arguments: argparse.Namespace) -> dict[st
         "rgb": read_rgb(names["rgb"]),
         "depth": read_depth(names["depth"]),
         "camera": read_camera(_camera_source(names["camera"]), image),
-        "masks": [None if path is None else read_mask(path) for path in names["masks"]],
+        "masks": [
+            None if path is None else read_mask(path, label) for path, label in zip(names["masks"], labels, strict=True)
+        ],
         "boxes": names["boxes"],
     }
     return inputs | {"seconds": round(time.perf_counter() - start, 6)}

@@ -101,7 +101,7 @@ MALFORMED = {
     "K singular": (text("camera.json", json.dumps(K | {"fx": 0})), {}, (), "singular"),
     "K not finite": (text("camera.json", json.dumps(K | {"fx": "nan"})), {}, (), "not finite"),
     "camera of another image": (text("camera.json", '{"7": {}, "8": {}}'), {}, (), "say which one"),
-    "camera broken": (text("camera.json", '{"fx": '), {}, (), "broken JSON"),
+    "camera broken": (text("camera.json", '{"fx": '), {}, (), "not valid JSON"),
     "camera of another size": (text("camera.json", json.dumps(K | dict(width=640, height=480))), {}, (), "640 × 480"),
     "lens unknown": (text("camera.json", json.dumps(K | dict(d=[1], distortion_model="mei"))), {}, (), "unknown lens"),
     "object truncated": (cut("mug.ipjax", 700), {}, (), "damaged"),
@@ -359,7 +359,8 @@ def found_case(tmp_path, monkeypatch):
         axes=jnp.eye(3),
     )
     info = dataclasses.replace(make_object()[1], encoder="cells", resolution=224, vertices=None, faces=None)
-    info = dataclasses.replace(info, pictures=np.stack([rgb, rgb]), colours=None)
+    unit = 0.3 * info.mesh_scale  # its diameter is 0.3 m
+    info = dataclasses.replace(info, pictures=np.stack([rgb, rgb]), colours=None, metres_per_unit=unit)
     save(tmp_path / "relief.ipjax", templates, info)
     for folder in ("rgb", "depth", "mask"):
         (tmp_path / "scene" / folder).mkdir(parents=True)

@@ -248,7 +248,7 @@ def test_thin_and_textureless_objects_are_warned_of(metric):
         (("none.jpg",), "no such photo"),
         (("p.png", "--unit", "mm"), "--unit does not belong to a photo"),
         (("m.ply", "--mask", "p.png"), "--mask does not belong to a mesh"),
-        (("p.png", "--box", "1,x"), "invalid list of numbers"),
+        (("p.png", "--box", "1,x"), "is no box"),
         (("p.png", "--report", "r.pdf"), "must end in .html"),
         (("p.png", "--depth", "p.png"), "give the camera too"),
         (("p.png",), "blank"),

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ipjax.host.images import BYTES_PER_PIXEL, as_mask, read_camera, read_depth, read_mask, read_rgb
+from ipjax.host.camera_files import read_camera
+from ipjax.host.images import BYTES_PER_PIXEL, as_mask, read_depth, read_mask, read_rgb, read_size
 from ipjax.host.meshes import Mesh, load_mesh, move
 from ipjax.host.storage import check_budget, read_json, write_text
 from ipjax.metrics import SYMMETRY_STEP, discretise_symmetries
@@ -246,8 +247,6 @@ class Dataset:
 
     def image_size(self, scene_id: int, im_id: int) -> tuple[int, int]:
         """(width, height) from the image's header, or from ``camera.json`` where the images are not there."""
-        from PIL import Image
-
         try:
             path = self.image_path(scene_id, im_id)
         except DatasetError:
@@ -258,11 +257,7 @@ class Dataset:
             size = {"size": [entry.get("width"), entry.get("height")]}
             width, height = _numbers(size, "size", 2, str(whole))
             return int(width), int(height)
-        try:
-            with Image.open(path) as image:
-                return image.size
-        except OSError as error:
-            raise DatasetError(f"{path}: not a readable image ({error})") from None
+        return _checked(read_size, path)
 
     def mask(self, scene_id: int, im_id: int, index: int, *, visible: bool = True) -> np.ndarray:
         """Mask of annotated instance ``index``: what is visible of it, or its whole silhouette."""

@@ -1,6 +1,7 @@
 """What works on this machine: versions, devices, renderers, weights, and a self-test of seconds."""
 
 import importlib.metadata
+import os
 import platform
 import sys
 import time
@@ -10,6 +11,11 @@ import numpy as np
 
 Line = tuple[bool, str, str]  # fine, subject, what there is to say
 
+# What JAX says of this is an assertion, or a page.
+NO_DEVICE = (
+    "JAX_PLATFORMS={} asks for devices that JAX does not have here; unset it, or install what they need "
+    "(pip install 'ipjax[cuda]' for NVIDIA)"
+)
 _PACKAGES = ("jax", "jaxlib", "flax", "equinox", "optimistix", "mujoco", "trimesh", "opencv-python-headless", "numpy")
 
 
@@ -26,10 +32,15 @@ def examine() -> Iterator[Line]:
             # OpenCV comes under several names.
             fine = name.startswith("opencv") and _imports("cv2")
             yield fine, name, "another build of OpenCV" if fine else f"missing: pip install {name}"
-    yield from _devices()
-    yield from _backends()
+    devices = list(_devices())
+    yield from devices
+    if all(fine for fine, _, _ in devices):
+        yield from _backends()
     yield from _weights()
-    yield self_test()
+    if all(fine for fine, _, _ in devices):
+        yield self_test()
+    else:
+        yield False, "self-test", "not tried without devices, nor were the renderers"
 
 
 def self_test() -> Line:
@@ -64,8 +75,9 @@ def _devices() -> Iterator[Line]:
 
     try:
         devices = jax.devices()
-    except RuntimeError as error:
-        yield False, "devices", _first_line(error)
+    except Exception as error:  # JAX asserts that it has the devices that JAX_PLATFORMS asks for
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        yield False, "devices", NO_DEVICE.format(asked) if asked else f"{type(error).__name__}: {_first_line(error)}"
         return
     names = ", ".join(f"{device.platform}:{device.id} {device.device_kind}" for device in devices)
     yield True, "devices", names

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from ipjax.config import Config
-from ipjax.host.images import as_intrinsics
+from ipjax.host.camera_files import as_intrinsics
 from ipjax.host.objects import ObjectInfo
 from ipjax.host.reports import UNSURE_TURN
 from ipjax.host.storage import writing

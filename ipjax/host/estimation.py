@@ -27,6 +27,7 @@ class Result:
     templates: Templates
     info: ObjectInfo
     seconds: dict[str, float]  # frame, describe, estimate; compile where it happened
+    warnings: tuple[str, ...] = ()  # what speaks against the answer, a sentence each
 
 
 class Estimator:
@@ -98,7 +99,9 @@ class Estimator:
         start = time.perf_counter()
         found = jax.block_until_ready(find(*arguments))
         seconds["estimate"] = time.perf_counter() - start
-        return Result(_turn(camera_from_crop, found), found, query, templates, info, seconds)
+        found, doubt = doubt_size(found, info, diameter, self.config.confidence.least)
+        warnings = (doubt,) if doubt else ()
+        return Result(_turn(camera_from_crop, found), found, query, templates, info, seconds, warnings)
 
     def _ready(self, name: str, function: Any, seconds: dict[str, float], *args: Any):
         leaves, structure = jax.tree.flatten(args)
@@ -109,6 +112,42 @@ class Estimator:
             self._compiled[key] = jax.jit(function).lower(*args).compile()
             seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - start
         return self._compiled[key]
+
+
+def doubt_size(
+    found: PoseEstimate, info: ObjectInfo, diameter: float | None = None, least: float = 0.5
+) -> tuple[PoseEstimate, str]:
+    """The estimate with less confidence where its size is not the one that the mesh file says.
+
+    Args:
+        found: an estimate of the object.
+        info: of the object; nothing happens where its ``metres_per_unit`` is unknown.
+        diameter: the diameter in metres that was given instead of found: it is compared, and the confidence stays.
+        least: confidence below which the object counts as not present.
+
+    Returns:
+        The estimate and a sentence with the usual causes; "" where the sizes are within 25 % of each other. The
+        confidence falls by exp(−½ (ln ratio / ln 1.25)²): to 0.6 of itself at the limit, 0.01 at twice the size.
+    """
+    if info.metres_per_unit is None or not bool(found.success):
+        return found, ""
+    known = info.metres_per_unit / info.mesh_scale
+    size = float(found.camera_from_object.scale) if diameter is None else diameter
+    if not (np.isfinite(size) and size > 0):
+        return found, ""
+    ratio = size / known
+    doubt = abs(np.log(ratio)) / np.log(1.25)
+    if doubt <= 1:
+        return found, ""
+    compared = f"{1e3 * size:.4g} mm, {ratio:.3g} times the {1e3 * known:.4g} mm of its mesh file"
+    if diameter is not None:
+        return found, f"{info.name}: the diameter given is {compared}"
+    confidence = jnp.asarray(float(found.confidence) * np.exp(-0.5 * doubt**2), found.confidence.dtype)
+    found = dataclasses.replace(found, confidence=confidence, present=found.present & (confidence >= least))
+    return found, (
+        f"{info.name}: the size found is {compared}: is the camera matrix of images of another size, the unit of the "
+        "depth (--depth-scale) another, or the unit of the mesh (onboard --unit)?"
+    )
 
 
 def _turn(camera_from_crop: Similarity, found: PoseEstimate) -> PoseEstimate:

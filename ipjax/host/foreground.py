@@ -5,14 +5,14 @@ one colour. Where none works, `find_foreground` refuses with one sentence, and l
 """
 
 import dataclasses
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, ImageOps
 
+from ipjax.host.images import as_mask, get_orientation, open_image, read_size
 from ipjax.host.storage import writing
 
 MAX_SIDE = 2048  # pixels; larger photos are reduced
@@ -32,6 +32,7 @@ class Photo:
     alpha: UInt8[np.ndarray, "h w"] | None = None  # None = opaque
     scale: float = 1.0  # pixels of this image per pixel of the file's upright image
     notes: tuple[str, ...] = ()
+    orientation: int = 1  # as EXIF said that the file's pixels are to be turned; done here
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,29 +54,14 @@ def read_photo(path: str | Path, *, max_side: int = MAX_SIDE) -> Photo:
 
     Raises ValueError in one sentence that names the file: missing, no image, broken, or float.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
+    full = max(read_size(path))
+    image = open_image(path, max_side=2 * max_side)  # a JPEG at a fraction: memory and time
+    orientation = get_orientation(image)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(path)
-            full = max(image.size)
-            if image.format == "JPEG" and max(image.size) > 2 * max_side:
-                image.draft(None, (2 * max_side, 2 * max_side))  # decode at a fraction: memory and time
-            image.load()
-            image = ImageOps.exif_transpose(image)
-    except UnidentifiedImageError:
-        raise ValueError(f"{path}: not an image") from None
-    except Image.DecompressionBombError:
-        raise ValueError(f"{path}: too many pixels to be a photo; reduce it first") from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        why = str(error).splitlines()[0] if str(error) else "unreadable"
-        raise ValueError(f"{path}: broken image ({why})") from None
-    try:
-        return _from_image(image, full, max_side)
+        photo = _from_image(ImageOps.exif_transpose(image), full, max_side)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    return dataclasses.replace(photo, orientation=orientation)
 
 
 def _from_image(image: Image.Image, full: int, max_side: int) -> Photo:
@@ -184,8 +170,6 @@ def _find(photo, mask, box, click, attempts) -> Foreground:
 
 def _fit_mask(mask: np.ndarray, photo: Photo) -> np.ndarray:
     import cv2
-
-    from ipjax.host.images import as_mask
 
     try:
         mask = as_mask(mask)

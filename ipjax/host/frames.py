@@ -3,19 +3,24 @@
 All of it is NumPy and OpenCV on the host, a few milliseconds for 640 × 480; the result holds JAX arrays.
 """
 
+import logging
 from typing import Any, Literal
 
 import cv2
 import jax.numpy as jnp
 import numpy as np
 
-from ipjax.host.images import Intrinsics, as_intrinsics, as_mask
+from ipjax.host.camera_files import Intrinsics, as_intrinsics, list_misfits
+from ipjax.host.images import as_mask, as_native, check_mask, forget_sentinel
 from ipjax.types import Camera, Similarity, View
 
 Background = Literal["black", "grey", "keep"]
 Crop = Literal["square", "look_at"]
 
 _FILL = {"black": 0.0, "grey": 0.5}
+log = logging.getLogger("ipjax")
+
+_SMALL = 200  # pixels of a mask below which people are told
 _NEAREST, _FARTHEST = 0.01, 30.0  # metres; a median depth outside is taken for a wrong unit
 
 
@@ -112,7 +117,7 @@ def frame_turned(
     intrinsics = as_intrinsics(camera)
     rgb = _check_rgb(rgb)
     height, width = rgb.shape[:2]
-    depth = np.asarray(depth)
+    depth = as_native(np.asarray(depth))
     depth = depth[..., 0] if depth.ndim == 3 and depth.shape[-1] == 1 else depth
     if depth.shape != (height, width):
         raise ValueError(
@@ -133,6 +138,15 @@ def frame_turned(
             raise ValueError(f"rgb is {width} × {height} but the mask is {_size_in_words(mask)}")
         if not mask.any():
             raise ValueError("the mask is empty")
+        if region is None:
+            check_mask(mask)
+        if 0 < mask.sum() < _SMALL:
+            log.warning("the mask has fewer than %d pixels: no pose can be exact", _SMALL)
+    for misfit in list_misfits(intrinsics, width, height):
+        log.warning("camera: %s", misfit)
+    depth, unknown = forget_sentinel(depth)
+    if unknown:
+        log.info("%s", unknown)
     scale = _depth_scale(depth, depth_scale, intrinsics)
 
     if intrinsics.distortion:
@@ -209,7 +223,7 @@ def clean_depth(depth: np.ndarray, edge_tolerance: float = 0.02) -> np.ndarray:
 
 def _check_rgb(rgb: Any) -> np.ndarray:
     """uint8 or float32 in [0, 1], height × width × 3."""
-    rgb = np.asarray(rgb)
+    rgb = as_native(np.asarray(rgb))
     if rgb.ndim == 2:
         rgb = np.repeat(rgb[..., None], 3, axis=-1)
     if rgb.ndim != 3 or rgb.shape[-1] not in (3, 4) or rgb.size == 0:

@@ -1,159 +1,65 @@
-"""Reading what a sensor wrote: colour, depth and mask images, and the camera that took them.
+"""Reading what a sensor wrote: colour, depth and mask images.
 
-Every reader raises one sentence of `ValueError` that names the file. Depth keeps the number type of its file; its unit
-is settled in `frames.frame`, by ``depth_scale`` (metres per depth unit).
+Every reader raises one sentence of `ValueError` that names the file, and none allocates more than `storage.budget`.
+Depth keeps the number type of its file; its unit is settled in `frames.frame`, by ``depth_scale`` (metres per unit).
 """
 
-import json
-import re
+import struct
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
-from ipjax.types import Camera
+from ipjax.host.camera_files import Intrinsics, as_intrinsics, read_camera
+from ipjax.host.storage import check_budget
+
+__all__ = [
+    "BYTES_PER_PIXEL",
+    "Intrinsics",
+    "as_intrinsics",
+    "as_mask",
+    "as_native",
+    "check_mask",
+    "forget_sentinel",
+    "get_orientation",
+    "open_image",
+    "read_camera",
+    "read_depth",
+    "read_mask",
+    "read_rgb",
+    "read_size",
+]
 
 BYTES_PER_PIXEL = 12  # of memory while an image is decoded, converted and copied
-
-# Names that ROS and OpenCV give to the lens models that OpenCV can undistort, and the lengths of their coefficients.
-_LENSES = {
-    "plumb_bob": (0, 4, 5),
-    "rational_polynomial": (0, 8, 12, 14),
-    "equidistant": (0, 4),
-    "opencv": (0, 4, 5, 8, 12, 14),
-}
-_LENS_ALIASES = {"": "opencv", "none": "opencv", "pinhole": "opencv", "radtan": "plumb_bob", "fisheye": "equidistant"}
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A camera as its file describes it.
-
-    Args:
-        matrix: K, 3 × 3, pixels; the first pixel's centre is (0, 0). Skew is refused.
-        distortion: coefficients in OpenCV's order; empty or all zero = a pinhole.
-        lens: "opencv", "plumb_bob", "rational_polynomial" or "equidistant" (OpenCV's fisheye).
-        size: (width, height) in pixels of the images it belongs to, where the file says so.
-        depth_scale: metres per unit of the depth image, where the file says so.
-
-    Raises:
-        ValueError: not a usable camera, in words.
-    """
-
-    matrix: np.ndarray
-    distortion: tuple[float, ...] = ()
-    lens: str = "opencv"
-    size: tuple[int, int] | None = None
-    depth_scale: float | None = None
-
-    def __post_init__(self):
-        matrix = np.asarray(self.matrix, np.float64)
-        if matrix.shape != (3, 3):
-            raise ValueError(f"the camera matrix must be 3 × 3, not {' × '.join(map(str, matrix.shape)) or 'a number'}")
-        if not np.isfinite(matrix).all():
-            raise ValueError("the camera matrix has entries that are not finite")
-        if not np.allclose(matrix[2], (0, 0, 1)) or matrix[1, 0] != 0:
-            raise ValueError("the camera matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], row by row")
-        if not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
-            raise ValueError(f"the camera matrix is singular or mirrored: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}")
-        if abs(matrix[0, 1]) > 1e-3 * matrix[0, 0]:
-            raise ValueError(f"the camera matrix has a skew of {matrix[0, 1]:g}, which is not supported")
-        ratio = matrix[0, 0] / matrix[1, 1]
-        if not 0.1 < ratio < 10:
-            raise ValueError(f"the focal lengths differ too much: fx = {matrix[0, 0]:g}, fy = {matrix[1, 1]:g}")
-        lens = str(self.lens).strip().lower()
-        lens = _LENS_ALIASES.get(lens, lens)
-        if lens not in _LENSES:
-            known = ", ".join(_LENSES)
-            raise ValueError(f"unknown lens model {self.lens!r}; undistort the images first, or use one of {known}")
-        distortion = tuple(float(c) for c in self.distortion)
-        if not np.isfinite(distortion).all():
-            raise ValueError("the distortion coefficients are not all finite")
-        if len(distortion) not in _LENSES[lens]:
-            raise ValueError(f"{len(distortion)} distortion coefficients do not fit the lens model {lens}")
-        scale = self.depth_scale
-        if scale is not None and not (np.isfinite(scale) and scale > 0):
-            raise ValueError(f"the depth scale must be a positive number, not {scale}")
-        object.__setattr__(self, "matrix", matrix)
-        object.__setattr__(self, "lens", lens)
-        object.__setattr__(self, "distortion", distortion if np.any(distortion) else ())
-
-    @property
-    def camera(self) -> Camera:
-        """The pinhole, as a record of arrays; distortion is not part of it."""
-        K = self.matrix
-        return Camera(
-            focal=jnp.asarray([K[0, 0], K[1, 1]], jnp.float32), centre=jnp.asarray([K[0, 2], K[1, 2]], jnp.float32)
-        )
-
-
-def as_intrinsics(camera: Any) -> Intrinsics:
-    """Whatever describes a camera: `Intrinsics`, a `Camera`, a 3 × 3 matrix, or (fx, fy, cx, cy).
-
-    Raises:
-        ValueError: none of these, or not a usable camera.
-    """
-    if isinstance(camera, Intrinsics):
-        return camera
-    if isinstance(camera, Camera):
-        focal, centre = np.asarray(camera.focal, np.float64), np.asarray(camera.centre, np.float64)
-        if focal.shape != (2,):
-            raise ValueError(f"frame takes one camera, not a batch of shape {focal.shape[:-1]}")
-        return _from_numbers(*focal, *centre)
-    if isinstance(camera, dict):
-        return read_camera(camera)
-    array = np.asarray(camera, np.float64)
-    if array.shape == (4,):
-        return _from_numbers(*array)
-    return Intrinsics(array)
-
-
-def read_camera(source: str | Path | dict, image: int | None = None) -> Intrinsics:
-    """A camera from BOP JSON (scene_camera.json, camera.json), plain fx fy cx cy, or ROS CameraInfo (YAML or JSON).
-
-    Args:
-        source: a file, or the dictionary it would hold. A text file may hold fx fy cx cy, or nine numbers row by row.
-        image: which image of a BOP ``scene_camera.json``; not needed where it holds only one.
-
-    Returns:
-        The intrinsics. A ``depth_scale`` in BOP's or a plain JSON file multiplies depth to millimetres, as BOP defines
-        it (https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md); here it becomes metres.
-
-    Raises:
-        ValueError: unreadable, or not a usable camera; names the file.
-    """
-    if isinstance(source, dict):
-        return _from_dict(source, image)
-    path = Path(source)
-    text = _read_text(path, "camera file")
-    try:
-        return _from_dict(_parse(text), image)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")  # Pillow knows more, some of which run programs
+_ORIENTATION = 0x0112  # EXIF
+_TURN = "ipjax orientation"  # among what Pillow knows of an image
+# The largest numbers of the types that depth is stored in, also where it has become another type since.
+_LARGEST = {float(2**bits - 1) for bits in (15, 16, 31, 32)}
+_LARGEST |= {float(np.float32(value)) for value in (2**31 - 1, 2**32 - 1)} | {float(np.finfo(np.float32).max)}
 
 
 def read_rgb(path: str | Path) -> np.ndarray:
-    """A colour image as uint8, height × width × 3; EXIF orientation applied, transparency dropped.
+    """A colour image as uint8, height × width × 3, as it is stored; transparency dropped.
 
     Raises:
-        ValueError: missing, unreadable or absurd; names the file.
+        ValueError: missing, unreadable, absurd, or to be turned according to its EXIF orientation; names the file.
     """
-    image = _open(path)
-    image = ImageOps.exif_transpose(image)
+    image = open_image(path)
+    _check_upright(get_orientation(image), path)
     if image.mode.startswith("I") or image.mode == "F":
         raise ValueError(f"{path}: a one-channel image of more than 8 bits is no colour image; is this the depth?")
     return np.array(image.convert("RGB"))
 
 
 def read_depth(path: str | Path) -> np.ndarray:
-    """A depth image as its file stores it: uint16 (PNG, TIFF) or float (TIFF, npy), height × width.
+    """A depth image as its file stores it, in this machine's byte order: uint16 (PNG, TIFF), other integers or floats
+    (TIFF, npy), height × width.
 
     Raises:
-        ValueError: missing, unreadable, 8-bit or coloured; names the file.
+        ValueError: missing, unreadable, 8-bit, coloured, or turned by its EXIF orientation; names the file.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
@@ -161,266 +67,367 @@ def read_depth(path: str | Path) -> np.ndarray:
     elif path.suffix.lower() == ".exr":
         raise ValueError(f"{path}: EXR is not supported; save the depth as 16-bit PNG, float TIFF or npy")
     else:
-        image = _open(path)
-        if image.mode not in ("I;16", "I;16B", "I;16L", "I;16N", "I", "F"):
-            raise ValueError(f"{path}: depth must be 16-bit or float with one channel, not 8-bit {image.mode}")
-        depth = np.array(image)
-        if image.mode == "I" and depth.min() >= 0 and depth.max() < 65536:
-            depth = depth.astype(np.uint16)
+        depth = _wide_tiff(path)
+        if depth is None:
+            image = open_image(path)
+            _check_upright(get_orientation(image), path)
+            if image.mode not in ("I;16", "I;16B", "I;16L", "I;16N", "I", "F"):
+                raise ValueError(f"{path}: depth must be 16-bit or float with one channel, not 8-bit {image.mode}")
+            depth = np.array(image)
+            if image.mode == "I" and depth.min() >= 0 and depth.max() < 65536:
+                depth = depth.astype(np.uint16)
     if depth.ndim == 3 and depth.shape[-1] == 1:
         depth = depth[..., 0]
     if depth.ndim != 2 or depth.size == 0:
         raise ValueError(f"{path}: depth must be height × width, not {' × '.join(map(str, depth.shape))}")
     if depth.dtype.kind not in "uif":
         raise ValueError(f"{path}: depth must be numbers, not {depth.dtype}")
-    return depth
+    return as_native(depth)
 
 
-def read_mask(path: str | Path) -> np.ndarray:
-    """A mask as bool, height × width: what is not black (8-bit: 128 and above where any pixel is that bright).
+def read_mask(path: str | Path, label: int | None = None) -> np.ndarray:
+    """A mask as bool, height × width: the bright one of two values; soft edges are cut in the middle.
+
+    Args:
+        path: an image (a palette counts as the colours in it), or npy.
+        label: the value of the object, in a file that numbers several: of a pixel, or of its entry in the palette.
 
     Raises:
-        ValueError: missing or unreadable; names the file.
+        ValueError: missing, unreadable, several labels and none asked for, a photo; names the file.
     """
     path = Path(path)
     if path.suffix.lower() == ".npy":
         mask = _load_npy(path)
     else:
-        image = ImageOps.exif_transpose(_open(path))
-        if image.mode in ("RGBA", "LA"):
-            # A cut-out photo carries its mask as transparency; an opaque one in its colours.
-            alpha = np.array(image.getchannel("A"))
-            mask = alpha if alpha.min() < 128 else np.array(image.convert("L"))
-        elif image.mode == "P":
-            mask = np.array(image)  # indices, not colours
-        else:
-            mask = np.array(image if image.mode in ("1", "L", "I", "I;16", "F") else image.convert("L"))
+        image = open_image(path)
+        _check_upright(get_orientation(image), path)
+        mask = _mask_values(image, label)
     try:
-        return as_mask(mask)
+        return as_mask(mask, label)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def as_mask(mask: Any) -> np.ndarray:
-    """Booleans from whatever masks come as: bool, 0/1, 0/255, probabilities; one channel or several.
+def _mask_values(image: Image.Image, label: int | None) -> np.ndarray:
+    if image.mode in ("P", "PA") and label is not None:
+        return np.array(image.getchannel(0) if image.mode == "PA" else image)
+    if image.mode in ("P", "PA"):
+        image = image.convert("RGBA" if "transparency" in image.info or image.mode == "PA" else "RGB")
+    if image.mode in ("RGBA", "LA"):
+        # A cut-out photo carries its mask as transparency, which may be soft everywhere; an opaque one in its colours.
+        alpha = np.array(image.getchannel("A"))
+        if alpha.min() < 128:
+            return alpha >= 128
+        image = image.convert("L" if image.mode == "LA" else "RGB")
+    if image.mode in ("1", "L", "I", "F") or image.mode.startswith("I;16"):
+        return np.array(image)
+    return np.array(image.convert("RGB"))
+
+
+def as_mask(mask: Any, label: int | None = None) -> np.ndarray:
+    """Booleans from whatever masks come as: bool, 0/1, 0/255, probabilities, soft edges; one channel or several.
+
+    Args:
+        mask: height × width, or height × width × channels, of which a fourth is dropped.
+        label: the value of the object, where the mask numbers several.
 
     Raises:
-        ValueError: wrong shape or not finite.
+        ValueError: wrong shape, not finite, more than two values that are no soft edge (labels, a photo).
     """
-    mask = np.asarray(mask)
+    mask = as_native(np.asarray(mask))
+    colours = None
     if mask.ndim == 3 and mask.shape[-1] in (1, 3, 4):
-        mask = mask[..., :3].max(axis=-1)
+        mask = mask[..., :3]
+        if mask.shape[-1] == 3 and not (mask == mask[..., :1]).all():
+            colours = mask
+        mask = mask.max(axis=-1)
     if mask.ndim != 2:
         raise ValueError(f"the mask must be height × width, not {' × '.join(map(str, mask.shape)) or 'a number'}")
-    if mask.dtype == bool:
-        return mask
-    if mask.dtype.kind == "f":
-        if not np.isfinite(mask).all():
-            raise ValueError("the mask has values that are not finite")
-        return mask > (0.5 if mask.max(initial=0) <= 1 else 127.5)
-    if mask.dtype.kind not in "ui":
+    if mask.dtype.kind not in "buif":
         raise ValueError(f"the mask must be numbers, not {mask.dtype}")
-    return mask >= 128 if mask.dtype == np.uint8 and mask.max(initial=0) >= 128 else mask > 0
+    if mask.dtype.kind == "f" and not np.isfinite(mask).all():
+        raise ValueError("the mask has values that are not finite")
+    if label is not None:
+        if colours is not None:
+            raise ValueError(f"the mask has colours, so that it has no label {label}")
+        found = mask == label
+        if not found.any():
+            raise ValueError(f"no pixel of the mask has the label {label}{_labels(mask)}")
+        return found
+    if mask.dtype == bool or mask.size == 0:
+        return mask.astype(bool)
+    if mask.dtype.kind == "f" and mask.min() >= 0 and mask.max() <= 1:
+        return mask > 0.5  # probabilities
+    return _cut(mask, colours)
 
 
-def _from_numbers(fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
-    return Intrinsics(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64))
+def check_mask(mask: np.ndarray) -> None:
+    """Refuse a mask that covers the whole image or looks inverted.
 
-
-def _from_dict(entry: Any, image: int | None) -> Intrinsics:
-    if isinstance(entry, list):
-        array = _numbers(entry, "the camera")
-        if array.size == 4:
-            return _from_numbers(*array.reshape(-1))
-        if array.size == 9:
-            return Intrinsics(array.reshape(3, 3))
-        raise ValueError(f"{array.size} numbers are no camera; fx fy cx cy, or nine numbers row by row, are expected")
-    if not isinstance(entry, dict) or not entry:
-        raise ValueError("no camera in it; BOP JSON, fx fy cx cy, or ROS CameraInfo is expected")
-    if all(str(key).isdigit() for key in entry):  # BOP scene_camera.json
-        images = {int(key): value for key, value in entry.items()}
-        if image is None and len(images) == 1:
-            image = next(iter(images))
-        if image is None:
-            raise ValueError(f"it holds the cameras of {len(images)} images; say which one")
-        if image not in images:
-            raise ValueError(f"it holds no camera for image {image}; it has {_some(sorted(images))}")
-        if not isinstance(images[image], dict):
-            raise ValueError(f"the entry of image {image} is no camera")
-        return _from_dict(images[image], None)
-    entry = {str(key).lower(): value for key, value in entry.items()}
-    if "camera_info" in entry and isinstance(entry["camera_info"], dict):
-        return _from_dict(entry["camera_info"], image)
-    size = _size(entry)
-    if "cam_k" in entry:
-        return Intrinsics(_matrix(entry["cam_k"]), size=size, depth_scale=_bop_depth_scale(entry))
-    if {"fx", "fy", "cx", "cy"} <= entry.keys():
-        numbers = _numbers([entry[key] for key in ("fx", "fy", "cx", "cy")], "fx, fy, cx, cy")
-        coefficients = next((entry[key] for key in ("distortion", "dist_coeffs", "coeffs", "d") if key in entry), None)
-        return Intrinsics(
-            _from_numbers(*numbers).matrix,
-            distortion=() if coefficients is None else tuple(_numbers(coefficients, "the distortion").reshape(-1)),
-            lens=str(entry.get("distortion_model", "opencv")),
-            size=size,
-            depth_scale=_bop_depth_scale(entry),
-        )
-    if "intrinsic_matrix" in entry:  # Open3D writes it column by column
-        return Intrinsics(_matrix(entry["intrinsic_matrix"]).T, size=size)
-    for key in ("camera_matrix", "k", "matrix"):
-        if key in entry:
-            coefficients = next((entry[d] for d in ("distortion_coefficients", "distortion", "d") if d in entry), ())
-            if isinstance(coefficients, dict):
-                coefficients = coefficients.get("data", ())
-            return Intrinsics(
-                _matrix(entry[key]),
-                distortion=tuple(_numbers(coefficients, "the distortion").reshape(-1)),
-                lens=str(entry.get("distortion_model", "opencv")),
-                size=size,
+    Raises:
+        ValueError: in words.
+    """
+    if mask.size and mask.all():
+        raise ValueError("the mask covers all of the image: nothing tells the object from its background")
+    if min(mask.shape, default=0) >= 3:
+        border = np.concatenate([mask[0], mask[-1], mask[1:-1, 0], mask[1:-1, -1]])
+        if border.mean() > 0.75:
+            raise ValueError(
+                f"the mask covers {border.mean():.0%} of the image's border and {mask.mean():.0%} of the image: "
+                "it looks inverted; the object must be white, all else black"
             )
-    raise ValueError(f"no camera among its entries ({_some(list(entry))}); cam_K, K, or fx, fy, cx and cy are expected")
 
 
-def _matrix(value: Any) -> np.ndarray:
-    if isinstance(value, dict):
-        value = value.get("data", ())
-    array = _numbers(value, "the camera matrix")
-    if array.size != 9:
-        raise ValueError(f"the camera matrix has {array.size} entries instead of 9")
-    return array.reshape(3, 3)
+def _cut(values: np.ndarray, colours: np.ndarray | None) -> np.ndarray:
+    """Numbers as booleans, where they are of two kinds, with a soft edge between them at most."""
+    low, high = values.min(), values.max()
+    if low < 0:
+        raise ValueError(f"the mask has negative values, down to {low:g}")
+    if high == 0:
+        return np.zeros(values.shape, bool)
+    # What counts as full: the type's white where it is (nearly) there, else the largest value.
+    full = float(high)
+    for white in (255, 65535):
+        if 0.9 * white <= high <= white and (values.dtype.kind == "f" or np.iinfo(values.dtype).max >= white):
+            full = float(white)
+            break
+    if low == high:
+        return np.ones(values.shape, bool)
+    if low > 0.1 * full:
+        raise ValueError(
+            f"the mask has no black: its values go from {low:g} to {high:g}; the object must be white, all else black"
+        )
+    dark, bright = values <= 0.1 * full, values >= 0.9 * full
+    found = values > 0.5 * full
+    if not ((values == low) | (values == high)).all():
+        _check_two_kinds(values, dark, bright, found)
+    if colours is not None:
+        seen = colours[bright].astype(np.float64)
+        other = np.abs(seen - np.median(seen, axis=0)).max(axis=-1) > 0.25 * full
+        if other.mean() > 0.01:
+            raise ValueError("the mask has more than two colours: is it a photo, or a picture of several objects?")
+    return found
 
 
-def _numbers(value: Any, what: str) -> np.ndarray:
-    try:
-        return np.asarray(value, np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{what} must be numbers") from None
+def _check_two_kinds(values: np.ndarray, dark: np.ndarray, bright: np.ndarray, found: np.ndarray) -> None:
+    """Refuse labels and photos: an edge is thin, and compression disturbs what is near an edge only."""
+    import cv2
+
+    def near(region: np.ndarray, reach: int) -> np.ndarray:
+        kernel = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+        return cv2.dilate(np.ascontiguousarray(region).view(np.uint8), kernel).view(bool)
+
+    between = ~dark & ~bright
+    stray = between & ~(near(dark, 5) & near(bright, 5))
+    for side, opposite in ((dark, ~dark), (bright, ~bright)):
+        inside = values[side]
+        kinds, counts = np.unique(inside, return_counts=True)
+        if len(kinds) > 1:
+            stray |= side & (values != kinds[counts.argmax()]) & ~near(opposite, 16)
+    mostly_edge = between.sum() > 3 * bright.sum() + 200  # which no object of some pixels' size has
+    if mostly_edge or stray.sum() > max(8, 0.001 * found.sum()):  # fewer are dirt
+        raise ValueError(
+            f"the mask has more than two values{_labels(values)}: is it a photo, or labels of several objects? "
+            "Give a mask that is white where the object is, or the label (--mask-label)"
+        )
 
 
-def _size(entry: dict) -> tuple[int, int] | None:
-    for width, height in (("width", "height"), ("image_width", "image_height")):
-        if width in entry and height in entry:
-            size = _numbers([entry[width], entry[height]], "the image size")
-            if np.isfinite(size).all() and (size > 0).all():  # ROS drivers leave 0 × 0 where they do not know
-                return int(size[0]), int(size[1])
-    return None
+def _labels(values: np.ndarray) -> str:
+    kinds = np.unique(values).astype(np.float64)
+    return f" ({', '.join(f'{kind:g}' for kind in kinds[:8])}{' …' if len(kinds) > 8 else ''})"
 
 
-def _bop_depth_scale(entry: dict) -> float | None:
-    if "depth_scale" not in entry:
-        return None
-    return float(_numbers(entry["depth_scale"], "the depth scale").reshape(())) * 1e-3
+def as_native(array: np.ndarray) -> np.ndarray:
+    """The same numbers in this machine's byte order and in a type that OpenCV has: it looks at bytes, not at types."""
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
+    if array.dtype.kind == "f" and array.dtype.itemsize not in (4, 8):
+        return array.astype(np.float32 if array.dtype.itemsize < 4 else np.float64)
+    if array.dtype.kind in "ui" and array.dtype not in (np.uint8, np.int8, np.uint16, np.int16, np.int32):
+        fits = array.size == 0 or (array.min() >= -(2**31) and array.max() < 2**31)
+        return array.astype(np.int32 if fits else np.float64)
+    return array
 
 
-def _some(items: list) -> str:
-    shown = ", ".join(str(item) for item in items[:6])
-    return shown + (" …" if len(items) > 6 else "")
+def forget_sentinel(depth: np.ndarray) -> tuple[np.ndarray, str]:
+    """Depth without a number that stands for "unknown": one extreme value on many pixels.
 
+    The largest number of its type (65535) is one wherever it occurs; another value is where it fills a twentieth of the
+    image and is far beyond (half as much again) or below (a fifth of) all others.
 
-def _parse(text: str) -> Any:
-    stripped = text.strip()
-    if not stripped:
-        raise ValueError("the file is empty")
-    if stripped[0] in "{[":
-        try:
-            return json.loads(stripped)
-        except json.JSONDecodeError as error:
-            raise ValueError(f"broken JSON: {error}") from None
-    words = re.split(r"[\s,;]+", stripped)
-    try:
-        return [float(word) for word in words if word]
-    except ValueError:
-        return _parse_yaml(stripped)
+    Args:
+        depth: height × width, numbers, any unit; 0 and what is negative or not finite is unknown already.
 
-
-def _parse_yaml(text: str) -> dict:
-    """The small part of YAML in which ROS writes CameraInfo: nested keys, [lists] and lists of '- number' lines."""
-    lines: list[str] = []
-    for raw in text.splitlines():
-        line = raw.split("#", 1)[0].rstrip()
-        if not line.strip() or line.strip() in ("---", "...") or line.startswith("%"):
+    Returns:
+        The depth with 0 in these pixels (the array itself where there are none), and a sentence, or "".
+    """
+    known = depth > 0
+    if depth.dtype.kind == "f":
+        known &= np.isfinite(depth)
+    values = depth[known]
+    if values.size == 0:
+        return depth, ""
+    found = []
+    for extreme, others in ((values.max(), np.max), (values.min(), np.min)):
+        same = values == extreme
+        count = int(same.sum())
+        rest = values[~same]
+        if count == 0 or rest.size == 0:
             continue
-        if lines and lines[-1].count("[") > lines[-1].count("]"):
-            lines[-1] += " " + line.strip()  # a [list] that goes on over several lines
-        else:
-            lines.append(line)
-
-    def block(start: int, indent: int) -> tuple[Any, int]:
-        mapping: dict[str, Any] = {}
-        items: list[Any] = []
-        i = start
-        while i < len(lines):
-            line, depth = lines[i].strip(), len(lines[i]) - len(lines[i].lstrip())
-            if depth < indent or (depth == indent and items and not line.startswith("-")):
-                break
-            if line.startswith("- "):
-                items.append(_scalar(line[2:]))
-                i += 1
-                continue
-            match = re.match(r"([\w/\-]+)\s*:(.*)", line)
-            if not match:
-                raise ValueError(f"neither JSON, numbers nor CameraInfo YAML: {line[:40]!r}")
-            name, value = match[1], match[2].strip()
-            i += 1
-            if value:
-                mapping[name] = _scalar(value)
-            elif i < len(lines):
-                following = len(lines[i]) - len(lines[i].lstrip())
-                # YAML lets the items of a list stand as far left as its key.
-                if following > depth or (following == depth and lines[i].strip().startswith("- ")):
-                    mapping[name], i = block(i, following)
-        return (items if items else mapping), i
-
-    parsed, _ = block(0, 0)
-    if not isinstance(parsed, dict):
-        raise ValueError("neither JSON, numbers nor CameraInfo YAML")
-    return parsed
+        is_largest = others is np.max and float(extreme) in _LARGEST
+        beyond = extreme >= 1.5 * others(rest) if others is np.max else extreme <= 0.2 * others(rest)
+        if is_largest or (count >= 0.05 * depth.size and beyond):
+            found.append(extreme)
+    if not found:
+        return depth, ""
+    depth = depth.copy()
+    said = []
+    for extreme in found:
+        same = depth == extreme
+        said.append(f"{extreme:g} on {same.mean():.0%} of the pixels")
+        depth[same] = 0
+    return depth, f"depth of {' and '.join(said)} is taken for unknown"
 
 
-def _scalar(text: str) -> Any:
-    text = text.strip()
-    if text.startswith("[") and text.endswith("]"):
-        return [_scalar(word) for word in text[1:-1].split(",") if word.strip()]
-    text = text.strip("\"'")
-    try:
-        return float(text)
-    except ValueError:
-        return text
+def read_size(path: str | Path) -> tuple[int, int]:
+    """(width, height) of an image, from its header.
+
+    Raises:
+        ValueError: missing or no image; names the file.
+    """
+    return open_image(path, load=False).size
 
 
-def _read_text(path: Path, what: str) -> str:
+def open_image(path: str | Path, *, load: bool = True, max_side: int | None = None) -> Image.Image:
+    """An image of one of the usual formats, decoded if its header promises no more pixels than memory allows.
+
+    Args:
+        path: PNG, JPEG, TIFF, BMP, WebP, GIF or PPM.
+        load: decode it, too.
+        max_side: a JPEG with a longer side may be decoded at a fraction of its size, not below this one.
+
+    Raises:
+        ValueError: missing, none of these, broken or too large; names the file.
+    """
+    path = Path(path)
     if not path.is_file():
-        raise ValueError(f"{path}: no such {what}")
+        raise ValueError(f"{path}: no such file")
     try:
-        return path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ValueError(f"{path}: not a text file") from None
-    except OSError as error:
-        raise ValueError(f"{path}: {error.strerror or error}") from None
+        with warnings.catch_warnings(), path.open("rb") as file:
+            warnings.simplefilter("ignore")
+            image = Image.open(file, formats=_FORMATS)
+            if not load:
+                return image
+            width, height = image.size
+            needed = 0
+            if max_side is not None and image.format in ("JPEG", "MPO") and max(image.size) > max_side:
+                # A progressive file is held as a whole whatever comes out of it.
+                needed = 6 * width * height if image.info.get("progressive") else 0
+                image.draft(None, (max_side, max_side))
+            needed += BYTES_PER_PIXEL * image.size[0] * image.size[1]
+            check_budget(needed, f"an image of {width} × {height} pixels")
+            turn = get_orientation(image)
+            image.load()  # which turns a TIFF and forgets that it did
+            image.info[_TURN] = turn
+    except UnidentifiedImageError:
+        raise ValueError(f"{path}: not an image") from None
+    except Image.DecompressionBombError:
+        raise ValueError(f"{path}: more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels; reduce it") from None
+    except MemoryError:
+        raise ValueError(f"{path}: out of memory") from None
+    except Exception as error:  # decoders of many formats fail in many ways
+        said = str(error).strip().splitlines() or [type(error).__name__]
+        known = isinstance(error, ValueError) and "allowed for one file" in said[0]
+        raise ValueError(f"{path}: {said[0]}" if known else f"{path}: broken image ({said[0]})") from None
+    return image
+
+
+def get_orientation(image: Image.Image) -> int:
+    """How EXIF says that an image is to be turned, 1 (as it is) to 8."""
+    if image.info.get(_TURN, 1) != 1:
+        return image.info[_TURN]
+    try:
+        turn = image.getexif().get(_ORIENTATION, 1)
+    except Exception:  # whatever a broken block of EXIF raises
+        return 1
+    return turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
+
+
+def _check_upright(turn: int, path: str | Path) -> None:
+    if 2 <= turn <= 8:
+        raise ValueError(
+            f"{path}: its EXIF orientation ({turn}) says that it is to be shown turned, which depth, mask and camera "
+            "know nothing of; save it without, all of them the same way up"
+        )
+
+
+def _wide_tiff(path: Path) -> np.ndarray | None:
+    """Depth from a TIFF of a number type that Pillow does not know (64-bit floats, signed 16 bits); None = no such."""
+    tags = _tiff_tags(path)
+    if tags is None:
+        return None
+    width, height, bits, samples, kind = (tags[number] for number in (256, 257, 258, 277, 339))
+    if samples != 1 or (bits, kind) in ((8, 1), (16, 1), (32, 3), (32, 2)) or bits < 16:
+        return None
+    import cv2
+
+    _check_upright(tags[_ORIENTATION], path)
+    check_budget(3 * (bits // 8) * width * height, f"{path}: an image of {width} × {height} pixels")
+    try:
+        depth = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        depth = None
+    if depth is None or depth.shape[:2] != (height, width):
+        name = {1: "unsigned", 2: "signed", 3: "floating-point"}.get(kind, "unknown")
+        raise ValueError(f"{path}: a TIFF of {bits}-bit {name} numbers cannot be read; save it as 16-bit or float32")
+    return depth
+
+
+def _tiff_tags(path: Path) -> dict[int, int] | None:
+    """Of a TIFF's first image: width (256), height (257), bits (258) and samples (277) per pixel, kind of number (339:
+    1 unsigned, 2 signed, 3 float), orientation (274); None where it is no classic TIFF."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(8)
+            order = {b"II*\0": "<", b"MM\0*": ">"}.get(head[:4])
+            if order is None or len(head) < 8:
+                return None
+            (start,) = struct.unpack(order + "I", head[4:])
+            if not 8 <= start <= size - 2:
+                return None
+            file.seek(start)
+            (count,) = struct.unpack(order + "H", file.read(2))
+            block = file.read(12 * count)
+    except (OSError, struct.error):
+        return None
+    tags = {256: 0, 257: 0, 258: 1, 277: 1, 339: 1, _ORIENTATION: 1}
+    for at in range(0, len(block) - 11, 12):
+        tag, kind, number = struct.unpack(order + "HHI", block[at : at + 8])
+        if tag in tags and kind in (3, 4) and number == 1:
+            (tags[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), block, at + 8)
+    return tags
 
 
 def _load_npy(path: Path) -> np.ndarray:
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+            if version not in read_header:
+                raise ValueError(f"version {version[0]}.{version[1]}")
+            shape, _, dtype = read_header[version](file)
+            if dtype.hasobject:
+                raise ValueError("it holds Python objects, not numbers")
+            promised = dtype.itemsize
+            for side in shape:
+                promised *= int(side)
+            there = path.stat().st_size - file.tell()
+            if promised > there:
+                raise ValueError(f"its header promises {promised:,} bytes, and there are {there:,}")
+        check_budget(3 * promised, "an array of this size")
         return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise ValueError(f"{path}: not a readable npy file ({str(error).splitlines()[0]})") from None
-
-
-def _open(path: str | Path) -> Image.Image:
-    path = Path(path)
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file")
-    try:
-        with warnings.catch_warnings(), path.open("rb") as file:
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(file)
-            image.load()
-    except UnidentifiedImageError:
-        raise ValueError(f"{path}: not an image") from None
-    except (Image.DecompressionBombWarning, Image.DecompressionBombError):
-        raise ValueError(f"{path}: more than {Image.MAX_IMAGE_PIXELS or 0:,} pixels") from None
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
-        why = str(error).splitlines()[0] if str(error) else "unreadable"
-        raise ValueError(f"{path}: broken image ({why})") from None
-    return image
+    except Exception as error:  # its header is parsed as Python, which fails in many ways
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{path}: not a readable npy file ({said})") from None

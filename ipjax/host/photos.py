@@ -1,6 +1,7 @@
 """From one photo to an object that can be found: mask, mesh, templates, and where the photo's camera stood."""
 
 import dataclasses
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,16 @@ import numpy as np
 from ipjax.config import OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.host import frames
+from ipjax.host.camera_files import Intrinsics, as_intrinsics, list_misfits, read_camera
 from ipjax.host.foreground import Foreground, Photo, find_foreground, read_photo
-from ipjax.host.images import Intrinsics, as_intrinsics, read_camera, read_depth, read_mask
+from ipjax.host.images import as_native, forget_sentinel, read_depth, read_mask
 from ipjax.host.objects import ObjectInfo, Reference, save
 from ipjax.host.onboarding import onboard
 from ipjax.host.reconstruction import Progress, Reconstruction, load_triposr, reconstruct, resolve_triposr
 from ipjax.host.weights import WeightsError, hash_file
 from ipjax.types import Camera, Templates
+
+log = logging.getLogger("ipjax")
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _PICTURE = 320  # pixels, longest side of the kept photo
@@ -121,6 +125,12 @@ def take_shot(
     if sum(option is not None for option in (mask, box, click)) > 1:
         raise ValueError("give one of mask, box and click, not several")
     photo = source if isinstance(source, Photo) else read_photo(source)
+    beside = [name for name, value in (("mask", mask), ("depth", depth), ("camera", camera)) if value is not None]
+    if photo.orientation != 1 and beside and not isinstance(source, Photo):
+        raise ValueError(
+            f"{source}: its EXIF orientation ({photo.orientation}) says that it is to be shown turned, and nothing "
+            f"says whether {' and '.join(beside)} belong to it as stored or as shown; save all of them the same way up"
+        )
     mask = read_mask(mask) if isinstance(mask, str | Path) else mask
     depth = read_depth(depth) if isinstance(depth, str | Path) else depth
     intrinsics = None
@@ -141,6 +151,9 @@ def take_shot(
     if click is not None and len(click) != 2:
         raise ValueError("a click is x, y in pixels")
     foreground = find_foreground(photo, mask=mask, box=box, click=click, tried=tried)
+    if intrinsics is not None:
+        for misfit in list_misfits(intrinsics, round(width / photo.scale), round(height / photo.scale)):
+            log.warning("camera: %s", misfit)
     metres = None
     if depth is not None:
         assert intrinsics is not None
@@ -173,8 +186,12 @@ def _to_metres(
     """The depth image in metres, as large as the photo as it was read (which may have been reduced)."""
     import cv2
 
+    depth = as_native(depth)
     if depth.ndim != 2:
         raise ValueError(f"depth has one number per pixel, not the shape {list(depth.shape)}")
+    depth, unknown = forget_sentinel(depth)
+    if unknown:
+        log.info("%s", unknown)
     height, width = mask.shape
     if depth.shape != mask.shape:
         if any(abs(d * scale - p) > 1.0 for d, p in zip(depth.shape, mask.shape, strict=True)):
