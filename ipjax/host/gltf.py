@@ -12,6 +12,7 @@ import io
 import json
 import math
 import struct
+from collections.abc import Sequence
 from typing import Any
 from urllib.parse import unquote_to_bytes
 
@@ -51,6 +52,7 @@ HARMLESS = {
     "KHR_xmp",
     "KHR_xmp_json_ld",
 }
+MOVES = {"matrix", "translation", "rotation", "scale"}
 COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
@@ -315,7 +317,7 @@ class _Reader:
             if index in seen:
                 raise ValueError(f"has a node, {index}, with two parents or in a circle")
             seen.add(index)
-            matrix = parent @ self.local(node)
+            matrix = parent @ self.local(node) if MOVES & node.keys() else parent
             if not np.isfinite(matrix).all():
                 raise ValueError(f"has a node, {index}, whose place is not finite")
             for child in self.items("children", node):
@@ -328,7 +330,7 @@ class _Reader:
             instances = self.instances(node)
             copies += len(instances)
             self.source.take(256 * len(instances), f"{copies:,} instances")
-            placed += [(node["mesh"], matrix @ instance, node) for instance in instances]
+            placed += [(node["mesh"], matrix if one is None else matrix @ one, node) for one in instances]
         return sorted(placed, key=lambda item: item[0])
 
     def local(self, node: dict) -> np.ndarray:
@@ -340,14 +342,17 @@ class _Reader:
             self.floats(node, "scale", [1, 1, 1]),
         )
 
-    def instances(self, node: dict) -> list[np.ndarray]:
-        """Where EXT_mesh_gpu_instancing puts the node's mesh; once at the node itself without."""
+    def instances(self, node: dict) -> Sequence[np.ndarray | None]:
+        """Where EXT_mesh_gpu_instancing puts the node's mesh; once, at the node itself (None), without."""
         found = self.extension(node, "EXT_mesh_gpu_instancing")
         if found is None:
-            return [np.eye(4)]
+            return [None]
         names = found.get("attributes")
         if not isinstance(names, dict):
             raise ValueError("has instances without attributes")
+        for index in names.values():
+            count = self.number(self.item("accessors", index), "count", 0, 3 * MAX_FACES)
+            self.source.take(1024 * count, f"{count:,} instances")
         rows = {}
         for name, shape in (("TRANSLATION", "VEC3"), ("ROTATION", "VEC4"), ("SCALE", "VEC3")):
             if name in names:
@@ -361,7 +366,6 @@ class _Reader:
             raise ValueError("has instances that are not finite")
         blank = {"TRANSLATION": [0.0, 0, 0], "ROTATION": [0.0, 0, 0, 1], "SCALE": [1.0, 1, 1]}
         table = {name: rows.get(name, np.tile(value, (count, 1))) for name, value in blank.items()}
-        self.source.take(1024 * count, f"{count:,} instances")
         return [compose(*(table[name][i] for name in blank)) for i in range(count)]
 
     # --- meshes ---

@@ -109,7 +109,7 @@ def split_blocks(data: bytes) -> Iterator[list[bytes]]:
         block = data[start:stop]
         if b"\\" in block:
             block = block.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-        yield block.splitlines()
+        yield [line for line in block.splitlines() if line]
         start = stop
 
 
@@ -155,6 +155,8 @@ def read_rows(lines: list[bytes], least: int, most: int) -> np.ndarray:
     result = np.full((len(lines), width), np.nan)
     groups: dict[int, tuple[list[int], list[list[bytes]]]] = {}
     for i, line in enumerate(lines):
+        if len(line) > 10_000:
+            raise ValueError(f"has a line of {len(line):,} characters where a few numbers belong")
         words = line.partition(b"#")[0].split() if b"#" in line else line.split()
         numbers, rows = groups.setdefault(len(words), ([], []))
         numbers.append(i)
@@ -180,6 +182,8 @@ def read_faces(lines: list[bytes], vertices: int, places: int) -> np.ndarray:
     result = []
     groups: dict[int, list[list[bytes]]] = {}
     for line in lines:
+        if len(line) > 1_000_000:
+            raise ValueError(f"has a face of {len(line):,} characters")
         words = line.partition(b"#")[0].split() if b"#" in line else line.split()
         groups.setdefault(len(words), []).append(words)
     for count, rows in groups.items():
