@@ -192,14 +192,16 @@ def _polar_of_triangles_jvp(primals, tangents):
 def _span(corners):
     """Two orthonormal vectors that span what three vectors of sum zero span, or more if they are collinear."""
     squares = [_dot(corner, corner) for corner in corners]
-    for i, j in ((0, 1), (0, 2)):  # the longest first
-        swap = squares[j] > squares[i]
+    # Readers that the compiler lets round for themselves must choose alike, or a vector gets components of two. So no
+    # comparison has a tie where sets have one: equal sides, and, of equal weights, what is left of two corners.
+    for i, j in ((0, 1), (0, 2)):  # the longest first, or nearly
+        swap = squares[j] > 1.17 * squares[i]
         corners[i], corners[j] = _choose(swap, corners[j], corners[i]), _choose(swap, corners[i], corners[j])
         squares[i], squares[j] = jnp.where(swap, squares[j], squares[i]), jnp.where(swap, squares[i], squares[j])
     zero = jnp.zeros_like(squares[0])
     first = _choose(squares[0] > 0, _normalise(corners[0]), (zero + 1, zero, zero))
     one, other = (_reject(corner, first) for corner in corners[1:])
-    second = _choose(_dot(other, other) > _dot(one, one), other, one)
+    second = _choose(_dot(other, other) > 5 * _dot(one, one), other, one)
     second = _reject(_normalise(_reject(second, first)), first)  # twice is enough, also of nearly parallel vectors
     x, y, z = (jnp.abs(component) for component in first)
     least = jnp.where((x <= y) & (x <= z), 0, jnp.where(y <= z, 1, 2))
