@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import commit, describe_device
-from ipjax.host.evaluation import FEW
+from ipjax.host.evaluation import FEW, SIZED
 from ipjax.host.storage import write_text
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
@@ -131,6 +131,18 @@ def tables(study: Study) -> list[tuple[str, list[list[str]]]]:
         cells += [percent(a.get("add_s_01d"))]
         rows.append([run["method"], *cells, "–" if seconds is None else f"{seconds:.1f}"])
     found.append(("Medians of what was found, areas under the curve to 10 cm, time", rows))
+    if any(run["all_frames"].get("sized") for run in runs):
+        rows = [["method", *(f"{name}, %" if "size" in name else f"AR {name}" for name in SIZED.values())]]
+        for run in runs:
+            sized = run["all_frames"].get("sized", {})
+            cells = [
+                "given" if knows_size(run) and name.startswith("size") else percent(sized.get(name)) for name in SIZED
+            ]
+            rows.append([run["method"], *cells])
+        heading = (
+            "The model at its estimated size, which BOP's recalls do not see, %, all frames; errors in true diameters"
+        )
+        found.append((heading, rows))
     metric = names[-1]
     rows = [["object", "targets", *(run["method"] for run in runs), "best"]]
     wins = dict.fromkeys(range(len(runs)), 0)
@@ -275,7 +287,8 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
         chosen = [("best", i) for i in ranked[:3]]
         chosen += [("median", i) for i in ranked[middle - 1 : middle + 2]]
         chosen += [("worst", i) for i in ranked[-3:][::-1]]
-    rows = {(r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next(run["folder"].glob("*.csv")))}
+    kept = run["folder"] / f"{run['method'].replace('_', '-')}_{run['dataset']}.csv"
+    rows = {(r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(kept)}
     drawn = draw_models(study, [one for _, one in chosen], rows)
     found = []
     for (kind, one), model in zip(chosen, drawn, strict=True):

@@ -861,6 +861,12 @@ examples:
 """,
     )
     parser.add_argument("results", type=Path, metavar="CSV", help="scene_id,im_id,obj_id,score,R,t,time; t in mm")
+    parser.add_argument(
+        "--sizes",
+        type=Path,
+        metavar="CSV",
+        help="the same with a column scale (default: CSV's .sized.csv, if it is there)",
+    )
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument("--split", default="test", help="which split (default test)")
     parser.add_argument("--metrics", nargs="+", choices=_METRICS, default=("mssd", "mspd", "vsd"))
@@ -886,6 +892,7 @@ def _score(arguments: argparse.Namespace) -> int:
         dataset,
         arguments.metrics,
         against=arguments.against,
+        sizes=True if arguments.sizes is None else arguments.sizes,
         on_error="skip" if arguments.skip_bad else "raise",
         progress=sys.stderr.isatty(),
         without=parse_images(arguments.without),

@@ -8,6 +8,7 @@ Object Localization", section 2.2. Comparisons are strict (error < threshold), e
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +20,7 @@ HIGHEST = jax.lax.Precision.HIGHEST
 SYMMETRY_STEP = 0.01  # BOP's max_sym_disc_step: the farthest a point may move between steps, in diameters
 THRESHOLDS = 0.05 * np.arange(1, 11)  # of the diameter: MSSD's and VSD's, and VSD's tolerances tau
 PIXEL_THRESHOLDS = 5.0 * np.arange(1, 11)  # MSPD, for images 640 pixels wide
+SIZE_TOLERANCES = np.array([0.02, 0.05, 0.1])  # of the true size: what counts as the right size
 ADD_LIMIT = 0.1  # metres: where the area under the accuracy-threshold curve of the YCB-V papers ends
 
 
@@ -83,7 +85,8 @@ def mssd(
 
     ``symmetries`` has one leading axis (see ``discretise_symmetries``; scale 1). The distance is convex in x, so the
     vertices of the convex hull give the same value as all vertices. Memory: vertices × 8, whatever the symmetries.
-    Unit: that of the points. BOP sets it to infinity where ``spheres_overlap`` is false.
+    Each pose maps the points with its own scale: where both are 1 (a BOP file holds no size) it is BOP's, else a wrong
+    size is part of the error. Unit: that of the points. BOP sets it to infinity where ``spheres_overlap`` is false.
     """
     return closest_symmetry(points, symmetries, truth, estimate)[0]
 
@@ -273,6 +276,54 @@ def add_s(
     padded = jnp.pad(moved, ((0, -count % block), (0, 0)))
     distances = jax.lax.map(nearest, padded.reshape(-1, block, 3)).reshape(-1)[:count]
     return estimate.scale * jnp.mean(distances)
+
+
+# Poses with their size
+
+
+class SizedErrors(eqx.Module):
+    """Errors of a pose with the model at its estimated size; a size that is wrong is an error like any other."""
+
+    mssd: Float[Array, "*b"]  # in true diameters; min over symmetries
+    add: Float[Array, "*b"]  # in true diameters
+    add_s: Float[Array, "*b"]  # in true diameters
+    size: Float[Array, "*b"]  # |estimated / true − 1|
+
+
+def sized_errors(
+    points: Float[Array, "n 3"],
+    symmetries: Similarity,
+    truth: Similarity,
+    estimate: Similarity,
+    *,
+    diameter: float | Float[Array, ""],
+) -> SizedErrors:
+    """What BOP's errors do not see: its files hold no size, so that its scores move the model rigidly, and a pose whose
+    size is wrong by a third is perfect. Here the estimate maps the model's points with its own scale.
+
+    Args:
+        points: of the model.
+        symmetries: one leading axis, see ``discretise_symmetries``.
+        truth, estimate: ``camera_from_object``; only the ratio of their scales counts as size.
+        diameter: of the points, in their unit; the truth's scale makes it the true diameter.
+
+    For the true rotation and a size wrong by a factor f about the point c, MSSD is |f − 1| · max |x − c| and ADD
+    |f − 1| · mean |x − c|, over the true diameter (by symmetries that keep c). BOP's thresholds (``THRESHOLDS``) and
+    ``SIZE_TOLERANCES`` go with it; BOP's pre-check of spheres does not.
+    """
+    unit = truth.scale * diameter
+    return SizedErrors(
+        mssd(points, symmetries, truth, estimate) / unit,
+        add(points, truth, estimate) / unit,
+        add_s(points, truth, estimate) / unit,
+        scale_error(truth.scale, estimate.scale),
+    )
+
+
+def average_recall(errors: Float[Array, "*b n"], thresholds: Float[Array, "t"] | None = None) -> Float[Array, "*b"]:
+    """Mean of the recalls at several thresholds (BOP's ten, in diameters, when None), in [0, 1]."""
+    chosen = jnp.asarray(THRESHOLDS if thresholds is None else thresholds, errors.dtype)
+    return jnp.mean(recall(errors, chosen), axis=-1)
 
 
 def area_under_accuracy(errors: Float[Array, "n"], limit: float = ADD_LIMIT) -> Float[Array, ""]:

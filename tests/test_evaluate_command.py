@@ -42,7 +42,7 @@ def finish(process: subprocess.Popen) -> str:
 
 def results(folder: Path) -> tuple[list[str], dict]:
     """The lines of the result file without their times, and the score without its times."""
-    (path,) = folder.glob("*.csv")
+    (path,) = folder.glob("*-test.csv")
     score = json.loads((folder / "score.json").read_text())
     del score["seconds_per_image"]
     return [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()], score
@@ -74,6 +74,11 @@ def test_the_tables_are_printed(place, whole):
     assert score["all_frames"]["recalls"]["ar"] > 0.4  # the set can be solved, so equal numbers mean something
     for word in ("AR_VSD", "AR_MSSD", "AR_MSPD", "one frame per scene", "all frames, without 1/0", "Median errors"):
         assert word in whole
+    assert "size to 5 %" in whole  # the sizes are kept beside the BOP file, and the command finds them there
+    (path,) = (place / "whole").glob("*-test.csv")
+    again = finish(start("ipjax", "score", path, place / "balls", "--metrics", "mssd", "mspd"))
+    line = next(x for x in whole.splitlines() if x.startswith("all frames ") and x.count("[") == 5)
+    assert line in again
     assert re.search(r"Time per image: \d", whole) and re.search(r"\d\.\d \[\d", whole)
 
 
@@ -116,6 +121,9 @@ def test_one_command_runs_all_and_makes_the_page(place, whole):
     ar = f"{100 * mine[1]['one_frame_per_scene']['recalls']['ar']:.1f}"
     assert re.search(rf"\| balls, scans \| ipjax-quick \| 2 \|.*\| {re.escape(ar)} \[", text)
     assert "| wins |" in text and str(place) not in text
+    kept = mine[1]["all_frames"]["sized"]
+    cells = " | ".join(f"{100 * kept[name]:.1f}" for name in ("size_2", "size_5", "size_10"))
+    assert "size to 10 % |" in text and f"| {cells} |" in text
     page = (place / "page" / "accuracy.html").read_text()
     assert page.count("data:image/jpeg;base64,") == 6 and page.count("<svg") == 5
     assert "http" not in page and "<script" not in page and str(place) not in page
@@ -128,7 +136,9 @@ def test_the_page_shows_the_model_where_the_estimate_is(place, whole):
     study = Study("balls", place / "balls", None, [run])
     from ipjax.host.bop import Dataset, read_results
 
-    rows = {(r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next((place / "whole").glob("*.csv")))}
+    rows = {
+        (r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next((place / "whole").glob("*-test.csv")))
+    }
     found = [i for i in run["instances"] if i["found"]][:2]
     dataset = Dataset(place / "balls")
     for one, picture in zip(found, draw_models(study, found, rows), strict=True):

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bop_roots import ERRORS, PROTOCOL, write_images, write_protocol
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ipjax.host import bop, evaluation, studies
 from ipjax.host.bop import DatasetError, Estimate, ResultRow
@@ -112,6 +114,95 @@ def test_the_truth_scores_one_on_every_metric(small):
     assert (found.missing, found.seconds_per_image) == (0, 0.5)
     assert json.loads(json.dumps(found.to_dict()))["all_frames"]["recalls"]["ar"] == 1.0
     assert "AR_VSD" in found.table() and "one frame per scene" in found.table()
+
+
+def shrunk(dataset: bop.Dataset, factor: float, seed: int = 0) -> tuple[list[ResultRow], list[float]]:
+    """Poses that are a little off, and one size for all."""
+    random = np.random.default_rng(seed)
+    rows = [replace(r, translation=tuple(np.add(r.translation, random.normal(0, 4, 3)))) for r in true_rows(dataset)]
+    return rows, [factor] * len(rows)
+
+
+@given(factor=st.floats(0.6, 1.6))
+@settings(max_examples=10)
+def test_a_wrong_size_costs_what_it_must_and_bops_figures_do_not_see_it(small, factor):
+    """True poses: MSSD at the estimated size is |f − 1| · the farthest vertex, and ADD(-S) no more than the mean."""
+    rows = true_rows(small)
+    names = ("mssd", "mspd", "add")
+    right = evaluation.score(rows, small, names, samples=0)
+    found = evaluation.score(rows, small, names, scales=[factor] * len(rows), samples=0)
+    assert found.all_frames.recalls == right.all_frames.recalls and found.add == right.add
+    assert right.all_frames.sized == {}
+    for one in found.instances:
+        arms = np.linalg.norm(small.mesh(one.obj_id).vertices, axis=-1)
+        assert one.sized_mssd == pytest.approx(abs(factor - 1) * arms.max(), abs=1e-7)
+        if one.obj_id == 2:  # three symmetries: ADD-S
+            assert one.sized_add <= abs(factor - 1) * arms.mean() + 1e-9
+    expected = np.mean(
+        [
+            [i.sized_mssd < t * small.models()[i.obj_id].diameter for t in evaluation.errors.THRESHOLDS]
+            for i in found.instances
+        ]
+    )
+    assert found.all_frames.sized["mssd"] == pytest.approx(expected)
+    shares = [found.all_frames.sized[f"size_{k}"] for k in (2, 5, 10)]
+    assert shares == [float(abs(factor - 1) < t) for t in (0.02, 0.05, 0.1)]
+
+
+def test_sized_errors_are_those_of_the_metrics(small):
+    """The scores' float64 figures against the public functions, pose by pose, where pose and size are both off."""
+    import jax.numpy as jnp
+
+    from ipjax import metrics
+    from ipjax.types import Similarity
+
+    rows, scales = shrunk(small, 1.07)
+    found = evaluation.score(rows, small, ("mssd", "mspd"), scales=scales, samples=0)
+    for one in found.instances:
+        row = next(r for r in rows if (r.im_id, r.obj_id) == (one.im_id, one.obj_id))
+        truth = small.truths(one.scene_id, one.im_id)[one.index]
+        model = evaluation.Model.load(small, one.obj_id)
+        pose = lambda R, t, s: Similarity(*(jnp.asarray(x, jnp.float32) for x in (R, t, s)))
+        expected = metrics.sized_errors(
+            jnp.asarray(model.points, jnp.float32),
+            pose(*model.symmetries, np.ones(len(model.rotations))),
+            pose(truth.rotation, truth.translation, 1.0),
+            pose(np.reshape(row.rotation, (3, 3)), np.multiply(row.translation, 1e-3), 1.07),
+            diameter=model.diameter,
+        )
+        assert one.sized_mssd / model.diameter == pytest.approx(float(expected.mssd), rel=1e-3)
+        assert one.sized_add / model.diameter == pytest.approx(float(expected.add_s), rel=1e-3)
+
+
+def test_sizes_are_kept_beside_the_bop_file_and_found_there(small, tmp_path):
+    rows, scales = shrunk(small, 1.03)
+    path = bop.write_results(tmp_path / "mine_small-test.csv", rows)
+    plain = path.read_text()
+    beside = bop.write_results(bop.sized_path(path), rows, scales=scales)
+    assert beside.name == "mine_small-test.sized.csv" and path.read_text() == plain
+    assert beside.read_text().splitlines()[1] == f"{plain.splitlines()[1]},1.03"  # BOP's row and a column
+    assert [row.scale for row in bop.read_results(beside)] == scales and bop.read_results(beside) == rows
+    names = ("mssd", "mspd")
+    given_ = evaluation.score(rows, small, names, scales=scales, samples=0).all_frames
+    run = lambda *a, **k: evaluation.score(*a, small, names, samples=0, **k)
+    assert run(path).all_frames == given_ == run(beside).all_frames
+    assert run(path, sizes=False).all_frames.sized == {}
+    moved = beside.rename(tmp_path / "elsewhere.csv")
+    assert run(path).all_frames.sized == {} and run(path, sizes=moved).all_frames == given_
+    assert "size to 5 %" in run(path, sizes=moved).table() and "size to" not in run(path).table()
+    # Sizes of other estimates: refused where asked for, left out and told where merely found.
+    others = bop.write_results(tmp_path / "others.csv", shrunk(small, 1.03, seed=1)[0], scales=scales)
+    with pytest.raises(DatasetError, match=r"others.csv: it holds no size for line 2 of mine_small-test.csv"):
+        run(path, sizes=others)
+    others.rename(beside)
+    found = run(path)
+    assert found.all_frames.sized == {} and any("so that sizes are left out" in note for note in found.notes)
+    for scale in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="its scale is"):
+            bop.write_results(tmp_path / "bad.csv", rows, scales=[scale] * len(rows))
+    (tmp_path / "bad.csv").write_text(beside.read_text().replace(",1.03", ",-1.03"))
+    with pytest.raises(DatasetError, match=r"line 2: scale must be positive, got -1.03"):
+        bop.read_results(tmp_path / "bad.csv")
 
 
 def test_a_missing_estimate_is_a_miss(small):
@@ -279,6 +370,9 @@ def run(small, folder, estimator, **settings):
 def test_a_killed_run_ends_with_the_same_numbers(small, tmp_path):
     whole = run(small, tmp_path / "whole", Noisy(small))
     assert whole.medians["scale_percent"] == pytest.approx(10.0)
+    kept = tmp_path / "whole" / "test_small-test.csv"  # found with its sizes, it scores the same
+    assert evaluation.score(kept, small, ("mssd", "mspd")).all_frames == whole.all_frames
+    assert whole.all_frames.sized["size_5"] == 0.0 and whole.all_frames.sized["mssd"] > 0
     calls: list = []
     for stop in (1, 3):
         with pytest.raises(KeyboardInterrupt):
@@ -397,10 +491,10 @@ def test_one_run_at_a_time(small, tmp_path):
             holder.kill()
 
 
-def test_the_truth_of_the_mini_set_scores_one(shared):
-    dataset = bop.Dataset(shared / "data" / "ycbv")
-    rows = true_rows(dataset)
-    found = evaluation.score(rows, dataset, ("mssd", "mspd", "add_s"), objects=[14, 18], samples=50)
+def test_the_truth_scores_one_whatever_its_symmetries(protocol):
+    """Several instances in an image, hundreds of symmetries, and one object in a frame off its centre."""
+    rows = true_rows(protocol)
+    found = evaluation.score(rows, protocol, ("mssd", "mspd", "add_s"), samples=50)
     assert found.all_frames.recalls == {"mssd": 1.0, "mspd": 1.0}
     assert found.add["add_or_s_auc"] == 1.0
 
@@ -534,6 +628,15 @@ def written(name, text):
         (rows("0,1,77,1.0,1 0 0 0 1 0 0 0 1,0 0 700,1"), "mine_small-test.csv, line 3: the data set has no object 77"),
         (rows(ROW), "mine_small-test.csv, line 3: .*same as that of line 2"),
         (rows("0,9,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,1"), "line 3: the data set has no image 9 in scene 0"),
+        (
+            rows("0,1,2,1.0,1.3 0 0 0 1.3 0 0 0 1.3,0 0 700,1"),
+            r"line 3: R is no rotation: it scales by 1.3 .*2.197",
+        ),
+        (rows("0,1,2,1.0,1 0 0 0 1 0 0 0 -1,0 0 700,1"), r"line 3: R is no rotation: it mirrors \(det R = -1,"),
+        (rows("0,1,2,1.0,1 0.3 0 0 1 0 0 0 1,0 0 700,1"), "line 3: R is no rotation: its rows are not at right angles"),
+        (rows("0,1,2,1.0,0 0 0 0 0 0 0 0 0,0 0 700,1"), "line 3: R is no rotation: "),
+        (rows("0,1,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,-2"), "line 3: time must be seconds, or -1 .*, got -2"),
+        (rows("0,1,2,inf,1 0 0 0 1 0 0 0 1,0 0 700,1"), "mine_small-test.csv, line 3: score .*not finite"),
         (rows("8,0,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,1"), "line 3: the data set has no image 0 in scene 8"),
         (lambda root, path: path.write_text("scene_id,im_id\n"), "mine_small-test.csv, line 1: the header must be"),
         (lambda root, path: path.unlink(), "mine_small-test.csv: .*cannot be read"),
@@ -557,6 +660,88 @@ def test_the_command_names_what_is_malformed(scored, damage, says):
     assert status == 2 and out == ""
     assert error.count("\n") == 1 and "Traceback" not in error
     assert re.search(says, error), error
+
+
+def turned(change):
+    """All annotated poses, changed as a whole."""
+
+    def damage(root, path):
+        bop.write_results(path, [change(row) for row in true_rows(bop.Dataset(root))])
+
+    return damage
+
+
+def moved(factor):
+    return lambda row: replace(row, translation=tuple(np.multiply(row.translation, factor)))
+
+
+def opposite(row):
+    """As OpenGL would have it: y up, z behind."""
+    flip = np.diag([1.0, -1, -1])
+    rotation = flip @ np.reshape(row.rotation, (3, 3))
+    return replace(row, rotation=tuple(rotation.ravel()), translation=tuple(flip @ row.translation))
+
+
+def strayed(row):
+    return replace(row, obj_id=1)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (moved(1e-3), "1000 times too small .* must be in millimetres; it seems to be in metres"),
+        (moved(0.1), "10 times too small .* must be in millimetres"),
+        (moved(1e3), "1000 times too large .* must be in millimetres"),
+        (opposite, "behind the camera .*: poses must be in OpenCV axes"),
+        (strayed, "none of the 4 estimates is of a target"),
+    ],
+)
+def test_the_command_says_what_is_wrong_with_all_of_a_file(scored, change, says):
+    """Files that would score 0 without a hint, though every row is in order."""
+    status, out, error = scored(turned(change))
+    assert status == 2 and out == "" and error.count("\n") == 1
+    assert re.search(says, error), error
+    status, out, _ = scored(lambda *_: None, "--skip-bad")
+    assert status == 0 and re.search(f"Note: .*{says}", out)
+
+
+@pytest.mark.parametrize("change", [moved(1.6), moved(0.6), moved((1, 1, -0.1)), moved((-5, -5, 1))])
+def test_what_is_merely_wrong_is_scored(scored, change):
+    """A method that fails on every target is no file in another unit."""
+    assert scored(turned(change))[0] == 0
+
+
+@given(seed=st.integers(0, 1000), noise=st.floats(0.0, 5e-4))
+def test_rotations_that_are_rounded_are_accepted(seed, noise):
+    """Official files have determinants within 0.003 of 1."""
+    random = np.random.default_rng(seed)
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    bop.check_rotation((turn + noise * random.uniform(-1, 1, (3, 3))).ravel())
+    bop.check_rotation((1.001 * turn).ravel())
+    for bad in (1.02 * turn, 0.98 * turn, -turn, turn @ np.diag([1, 1.02, 1]), 0 * turn):
+        with pytest.raises(ValueError, match="R is no rotation"):
+            bop.check_rotation(bad.ravel())
+
+
+def test_estimates_of_no_target_are_counted(small):
+    rows = true_rows(small)
+    more = [replace(rows[0], obj_id=1), *rows]
+    found = evaluation.score(more, small, ("mssd",), samples=0)
+    assert found.all_frames.recalls["mssd"] == 1.0
+    assert any("1 of 9 estimates are of no target" in note for note in found.notes)
+    with pytest.raises(DatasetError, match="line 2: R is no rotation: it scales by"):
+        evaluation.score([replace(r, rotation=tuple(np.multiply(r.rotation, 1.5))) for r in rows], small, ("mssd",))
+
+
+def test_an_estimator_that_returns_no_pose_is_told(small, tmp_path):
+    def estimator(scale, stretch):
+        return lambda frame, targets: [Estimate(2, 1.0, stretch * np.eye(3), np.ones(3), scale)]
+
+    with pytest.raises(ValueError, match="object 2: R is no rotation: it scales by 2"):
+        run(small, tmp_path / "a", estimator(1.0, 2.0))
+    with pytest.raises(ValueError, match="the size of the estimate of object 2 is not positive"):
+        run(small, tmp_path / "b", estimator(0.0, 1.0))
 
 
 def test_the_command_scores_and_goes_on_where_asked(scored, tmp_path):

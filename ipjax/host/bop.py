@@ -25,6 +25,8 @@ from ipjax.metrics import SYMMETRY_STEP, discretise_symmetries
 MM = 1e-3  # metres
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
+SIZED_HEADER = HEADER + ",scale"  # ours: x_camera = scale · R · x_model + t
+ROTATION_SLACK = 0.01  # how far the singular values of a rotation may be from 1
 VISIBLE = 0.1  # share of an instance that must be visible for it to be a target (enumerate_test_targets.py)
 
 
@@ -126,6 +128,7 @@ class ResultRow:
     translation: tuple[float, ...]  # three numbers, mm
     time: float = -1.0  # for the whole image; −1 = unknown
     line: int | None = field(default=None, compare=False)  # where it was read
+    scale: float | None = field(default=None, compare=False)  # estimated over true size; None = unknown
 
 
 def parse_images(names: Iterable[str] | None) -> list[tuple[int, int]]:
@@ -617,9 +620,11 @@ def detected_targets(detections: Iterable[Detection], rows: Sequence[TargetRow])
 def read_results(path: str | Path, *, problems: list[str] | None = None) -> list[ResultRow]:
     """The rows of a BOP result file.
 
+    A file of ours with the sizes (see `write_results`) has an eighth column, ``scale``.
+
     Raises DatasetError (file, line, what is wrong) for a wrong header, a wrong number of columns or numbers, values
-    that are not finite, rows that occur twice, or times that differ within an image. Give a list as ``problems`` to
-    have such rows left out, and the sentences collected there, instead.
+    that are not finite, an R that is no rotation, rows that occur twice, or times that are negative or differ within
+    an image. Give a list as ``problems`` to have such rows left out, and the sentences collected there, instead.
     """
     path = Path(path)
     try:
@@ -628,7 +633,8 @@ def read_results(path: str | Path, *, problems: list[str] | None = None) -> list
         raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise DatasetError(f"{path}: not a text file") from None
-    if not lines or lines[0].strip().replace(" ", "") != HEADER:
+    header = lines[0].strip().replace(" ", "") if lines else ""
+    if header not in (HEADER, SIZED_HEADER):
         first = lines[0].strip()[:80] if lines else "nothing"
         raise DatasetError(f"{path}, line 1: the header must be {HEADER!r}, not {first!r}")
     rows: list[ResultRow] = []
@@ -638,7 +644,7 @@ def read_results(path: str | Path, *, problems: list[str] | None = None) -> list
         if not line.strip():
             continue
         try:
-            row = _parse_row(line, number)
+            row = _parse_row(line, number, header)
             key = (row.scene_id, row.im_id, row.obj_id, row.score, row.rotation, row.translation)
             if key in first_line:
                 raise ValueError(f"the row is the same as that of line {first_line[key]}")
@@ -658,10 +664,11 @@ def read_results(path: str | Path, *, problems: list[str] | None = None) -> list
     return rows
 
 
-def _parse_row(line: str, number: int) -> ResultRow:
+def _parse_row(line: str, number: int, header: str = HEADER) -> ResultRow:
     columns = line.strip().split(",")
-    if len(columns) != 7:
-        raise ValueError(f"7 columns are expected ({HEADER}), got {len(columns)}")
+    expected = header.count(",") + 1
+    if len(columns) != expected:
+        raise ValueError(f"{expected} columns are expected ({header}), got {len(columns)}")
     whole = []
     for name, text in zip(("scene_id", "im_id", "obj_id"), columns[:3], strict=True):
         if not re.fullmatch(r"\s*\d+\s*", text):
@@ -670,8 +677,29 @@ def _parse_row(line: str, number: int) -> ResultRow:
     score = _parse_numbers(columns[3], 1, "score")[0]
     rotation = _parse_numbers(columns[4], 9, "R")
     translation = _parse_numbers(columns[5], 3, "t")
+    check_rotation(rotation)
     time = _parse_numbers(columns[6], 1, "time")[0]
-    return ResultRow(whole[0], whole[1], whole[2], score, rotation, translation, time, number)
+    if time < 0 and time != -1:
+        raise ValueError(f"time must be seconds, or -1 where it is unknown, got {time:g}")
+    scale = _parse_numbers(columns[7], 1, "scale")[0] if expected == 8 else None
+    if scale is not None and not scale > 0:
+        raise ValueError(f"scale must be positive, got {scale:g}")
+    return ResultRow(whole[0], whole[1], whole[2], score, rotation, translation, time, number, scale)
+
+
+def check_rotation(rotation: Sequence[float] | np.ndarray) -> None:
+    """Nothing where nine numbers are a rotation, row by row, up to rounding (official result files have determinants
+    within 0.003 of 1). Raises ValueError, in words, for what scales, mirrors or shears.
+    """
+    matrix = np.asarray(rotation, np.float64).reshape(3, 3)
+    stretch, det = np.linalg.svd(matrix, compute_uv=False), float(np.linalg.det(matrix))
+    if np.abs(stretch - 1).max() <= ROTATION_SLACK and det > 0:
+        return
+    if np.ptp(stretch) <= ROTATION_SLACK * max(stretch.max(), 1) and stretch.mean() > ROTATION_SLACK:
+        way = f"it scales by {stretch.mean():.4g}" if det > 0 else "it mirrors"
+    else:
+        way = "its rows are not at right angles and of length 1"
+    raise ValueError(f"R is no rotation: {way} (det R = {det:.4g}, where 1 is expected)")
 
 
 def _parse_numbers(text: str, count: int, name: str) -> tuple[float, ...]:
@@ -702,13 +730,29 @@ def format_row(row: ResultRow) -> str:
     return f"{row.scene_id},{row.im_id},{row.obj_id},{float(row.score)!r},{R},{t},{time}"
 
 
-def write_results(path: str | Path, rows: Iterable[ResultRow]) -> Path:
-    """Write a result file as BOP's toolkit does (no newline at the end), whole or not at all."""
-    return write_text(path, "\n".join([HEADER, *map(format_row, rows)]), parents=True)
+def write_results(path: str | Path, rows: Iterable[ResultRow], *, scales: Sequence[float] | None = None) -> Path:
+    """Write a result file as BOP's toolkit does (no newline at the end), whole or not at all.
+
+    With ``scales`` (estimated over true size, one for each row) it is no BOP file but one of ours, with a column more;
+    `sized_path` says where it belongs. Raises ValueError for a scale that is not positive and finite.
+    """
+    if scales is None:
+        return write_text(path, "\n".join([HEADER, *map(format_row, rows)]), parents=True)
+    lines = [SIZED_HEADER]
+    for row, scale in zip(rows, scales, strict=True):
+        if not 0 < scale < math.inf:
+            raise ValueError(f"scene {row.scene_id}, image {row.im_id}, object {row.obj_id}: its scale is {scale}")
+        lines.append(f"{format_row(row)},{float(scale)!r}")
+    return write_text(path, "\n".join(lines), parents=True)
+
+
+def sized_path(path: str | Path) -> Path:
+    """Where the sizes of a BOP result file are kept: beside it, under ``.sized.csv``."""
+    return Path(path).with_suffix(".sized.csv")
 
 
 def as_row(scene_id: int, im_id: int, estimate: Estimate, time: float = -1.0) -> ResultRow:
-    """An estimate as a row: metres become millimetres. A scale other than 1 is lost (a BOP row has no place for it)."""
+    """An estimate as a row: metres become millimetres. A BOP row has no place for the scale."""
     rotation = np.asarray(estimate.rotation, np.float64).reshape(9)
     translation = np.asarray(estimate.translation_m, np.float64).reshape(3) * 1000
     return ResultRow(

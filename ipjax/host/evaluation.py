@@ -37,8 +37,10 @@ from ipjax.host.bop import (
     TargetRow,
     Truth,
     as_row,
+    check_rotation,
     detected_targets,
     read_results,
+    sized_path,
     write_results,
 )
 from ipjax.host.meshes import Mesh
@@ -53,6 +55,9 @@ DELTA = 0.015  # metres: VSD's visibility tolerance
 FEW = 10
 LISTED = 20  # images that failed and are told with their reason
 DETECTIONS = 100  # estimates per image that count for average precision (BOP 2024)
+SIZED = {"mssd": "MSSD", "add_or_s": "ADD(-S)"} | {
+    f"size_{round(100 * x)}": f"size to {100 * x:g} %" for x in errors.SIZE_TOLERANCES.tolist()
+}  # recalls of poses with their size
 BATCH = 64  # pairs of poses per call
 DRAWN = 48_000_000  # pixels drawn by one process for VSD; seven bytes each
 Estimator = Callable[[Frame, list[Target]], list[Estimate]]
@@ -147,6 +152,11 @@ class Model:
     rotations: np.ndarray  # symmetries [s, 3, 3]
     translations: np.ndarray  # [s, 3]
 
+    @property
+    def symmetries(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations and translations."""
+        return self.rotations, self.translations
+
     @staticmethod
     def load(dataset: Dataset, obj_id: int) -> "Model":
         """From the data set's ``models_eval``."""
@@ -171,6 +181,39 @@ class SurfaceErrors:
     mspd: np.ndarray  # pixels
     rotation: np.ndarray  # radians, to the symmetry that attains MSSD
     translation: np.ndarray  # metres, likewise
+
+
+def sized_distances(
+    model: Model, truths: Sequence[Pose], estimates: Sequence[Pose], scales: np.ndarray, *, nearest: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """`metrics.sized_errors` in float64 for pairs of poses: MSSD, and ADD (with ``nearest`` ADD-S), in metres, of the
+    model at its estimated size (``scales``, estimated over true)."""
+    from scipy.spatial import KDTree
+
+    hull = _hull(model.points)
+    mssd, mean = np.zeros(len(truths)), np.zeros(len(truths))
+    tree = KDTree(model.points) if nearest and len(truths) else None
+    constant = [jnp.asarray(x, jnp.float32) for x in (_padded(hull), *_padded_symmetries(*model.symmetries))]
+    for row, (truth, estimate, scale) in enumerate(zip(truths, estimates, scales, strict=True)):
+        R_e, shift = scale * estimate.rotation, truth.translation - estimate.translation
+        pose = [truth.rotation, truth.translation, estimate.rotation, estimate.translation, scale]
+        best = 0 if len(model.rotations) == 1 else int(_choose_sized(*constant, *(np.float32(x) for x in pose)))
+        R_s, t_s = _symmetric(model, truth.rotation, truth.translation, best)
+        mssd[row] = np.linalg.norm(hull @ (R_e - R_s).T + (estimate.translation - t_s), axis=-1).max()
+        moved = model.points @ (truth.rotation - R_e).T + shift
+        if tree is None:
+            mean[row] = np.linalg.norm(moved, axis=-1).mean()
+        else:  # in the estimate's frame, where the model is what the tree holds; equal poses give exactly x
+            mean[row] = scale * tree.query(model.points + moved @ estimate.rotation / scale, workers=-1)[0].mean()
+    return mssd, mean
+
+
+@jax.jit
+def _choose_sized(hull, rotations, translations, R_g, t_g, R_e, t_e, scale):
+    """The symmetry that attains MSSD of the model at its estimated size."""
+    one = jnp.ones((), hull.dtype)
+    symmetries = Similarity(rotations, translations, jnp.ones(len(rotations), hull.dtype))
+    return errors.closest_symmetry(hull, symmetries, Similarity(R_g, t_g, one), Similarity(R_e, t_e, scale))[1]
 
 
 def surface_errors(
@@ -305,7 +348,9 @@ class Instance:
     add_s: float
     rotation: float  # radians, symmetry-aware
     translation: float  # metres
-    scale: float  # share; NaN where the scale is unknown
+    scale: float  # |estimated / true − 1|; NaN where the scale is unknown
+    sized_mssd: float = math.nan  # metres, with the model at its estimated size; NaN likewise
+    sized_add: float = math.nan  # likewise; ADD-S for objects with symmetries
 
 
 @dataclass(frozen=True)
@@ -318,6 +363,10 @@ class Summary:
         str, float
     ]  # average recall by metric; "ar" is the mean of MSSD's, MSPD's and VSD's, if all are there
     intervals: dict[str, tuple[float, float]]  # 95 % bootstrap over images
+    # Where the estimates' sizes are known: average recalls "mssd" and "add_or_s" of the model at its estimated size, in
+    # true diameters, and the shares of targets whose size is right to 2, 5 and 10 %; their intervals. Else empty.
+    sized: dict[str, float] = field(default_factory=dict)
+    sized_intervals: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -373,6 +422,7 @@ def score(
     against: "str | Path | Sequence[ResultRow] | Score | None" = None,
     alignments: Mapping[int, Alignment] | None = None,
     scales: Sequence[float] | None = None,
+    sizes: str | Path | bool = True,
     symmetric: Iterable[int] | None = None,
     delta: float = DELTA,
     on_error: Literal["raise", "skip"] = "raise",
@@ -393,7 +443,10 @@ def score(
         against: a second result file, for wins by object.
         alignments: for objects whose rows give the pose of a reconstructed mesh, scaled to its true size, in the mesh's
             own frame: the evaluation-only similarity to the annotated model. The table says that it was used.
-        scales: the estimated scale (1 = right) of each row, where it is known; a result file cannot hold it.
+        scales: the estimated scale (estimated over true size) of each row; a BOP file cannot hold it. With sizes, the
+            score has `Summary.sized`, which BOP's figures cannot see.
+        sizes: the file with the sizes of a result file, as `evaluate` writes it; True: the one beside it, if there is
+            one (``.sized.csv``); False: none.
         symmetric: objects for which ADD(-S) is ADD-S; default: YCB-V's list, or those with symmetries.
         delta: VSD's visibility tolerance, metres (ITODD: 0.005).
         on_error: "raise" stops at the first damaged file or row; "skip" goes on and lists them in ``problems``.
@@ -408,13 +461,13 @@ def score(
     job = _Job(dataset, tuple(metrics), objects, delta, on_error, symmetric, progress, without)
     job.notes += notes
     method = method or (Path(results).stem if isinstance(results, str | Path) else "results")
-    rows = job.rows(results)
-    if scales is not None and len(scales) != len(rows):
-        raise ValueError(f"{len(rows)} rows need as many scales, got {len(scales)}")
+    rows = job.rows(results, scales)
+    if isinstance(results, str | Path) and scales is None and sizes is not False:
+        rows = job.with_sizes(rows, Path(results), sizes)
     if alignments:
         rows = [_aligned(row, alignments.get(row.obj_id)) for row in rows]
         job.notes += _alignment_notes(alignments)
-    found = job.score(rows, scales, method, samples, seed)
+    found = job.score(rows, method, samples, seed)
     if against is None:
         return found
     if not isinstance(against, Score):
@@ -427,6 +480,7 @@ def score(
             delta=delta,
             on_error=on_error,
             samples=0,
+            sizes=False,
             method=name,
             progress=progress,
         )
@@ -470,13 +524,14 @@ class _Slot:
     truths: list[Truth]
     valid: np.ndarray  # which truths count
     estimates: list[ResultRow]
-    scales: list[float]
     mssd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # [e, g], and so on
     mspd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     rotation: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     translation: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     add: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     add_s: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    sized_mssd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    sized_add: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     vsd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))  # [e, g, t]
 
     def pairs(self) -> Iterator[tuple[int, int]]:
@@ -489,6 +544,8 @@ class _Job:
     def __init__(self, dataset, metrics, objects, delta, on_error, symmetric, progress, without=()):
         self.dataset, self.metrics, self.delta, self.on_error = dataset, metrics, delta, on_error
         self.problems: list[str] = []
+        self.sized = False  # whether the size of every estimate is known
+        self.source = "results"
         self._annotations: dict[tuple[int, int], tuple[np.ndarray, int, list[Truth]]] = {}
         self.notes: list[str] = []
         self.progress = progress
@@ -525,14 +582,18 @@ class _Job:
             self._annotations[key] = (self.dataset.camera(*key)[0], width, self.dataset.truths(*key))
         return self._annotations[key]
 
-    def rows(self, results: str | Path | Sequence[ResultRow]) -> list[ResultRow]:
-        """The rows, each of an object and an image that exist."""
+    def rows(self, results: str | Path | Sequence[ResultRow], scales: Sequence[float] | None = None) -> list[ResultRow]:
+        """The rows, each a rotation, of an object and an image that exist; with the scales, where they are given."""
         skip = self.on_error == "skip"
         if isinstance(results, str | Path):
-            source = str(results)
+            source = self.source = str(results)
             rows = read_results(results, problems=self.problems if skip else None)
         else:
             source, rows = "results", list(results)
+        if scales is not None:
+            if len(scales) != len(rows):
+                raise ValueError(f"{len(rows)} rows need as many scales, got {len(scales)}")
+            rows = [replace(row, scale=float(scale)) for row, scale in zip(rows, scales, strict=True)]
         targeted = {(t.scene_id, t.im_id) for t in self.dataset.targets}
         there: dict[int, set[int]] = {}
         kept = []
@@ -550,6 +611,11 @@ class _Job:
                 if row.im_id not in there[row.scene_id]:
                     message = f"{where}: the data set has no image {row.im_id} in scene {row.scene_id}"
             if message is None:
+                try:
+                    check_rotation(row.rotation)
+                except ValueError as error:
+                    message = f"{where}: {error}"
+            if message is None:
                 kept.append(row)
             elif skip:
                 self.problems.append(message)
@@ -557,8 +623,52 @@ class _Job:
                 raise DatasetError(message)
         return kept
 
-    def score(self, rows, scales, method, samples, seed) -> Score:
-        slots = self.slots(rows, scales)
+    def with_sizes(self, rows: list[ResultRow], results: Path, sizes: str | Path | bool) -> list[ResultRow]:
+        """The rows with the scales that stand in a file of ours; each must be there. One that was merely found beside
+        the results and belongs to others is left out, and the table says so."""
+        beside = isinstance(sizes, bool)
+        path = sized_path(results) if beside else Path(sizes)
+        if beside and (not path.is_file() or all(row.scale is not None for row in rows)):
+            return rows
+        kept = {_identity(row): row.scale for row in read_results(path, problems=self.problems if beside else None)}
+        for row in rows:
+            if kept.get(_identity(row)) is None:
+                message = f"{path}: it holds no size for line {row.line} of {results.name}"
+                if not beside:
+                    raise DatasetError(message)
+                self.notes.append(f"{message}, so that sizes are left out")
+                return rows
+        return [replace(row, scale=kept[_identity(row)]) for row in rows]
+
+    def check_conventions(self, slots: list[_Slot], rows: list[ResultRow]) -> None:
+        """Whole files that are in another unit, in other axes, or of other targets would score 0 without a hint."""
+        targets = {(t.scene_id, t.im_id, t.obj_id) for t in self.dataset.targets}
+        strays = sum((row.scene_id, row.im_id, row.obj_id) not in targets for row in rows)
+        message = _suspect_conventions(
+            [
+                (np.asarray(row.translation) * MM, np.median([t.translation for t in slot.truths], axis=0))
+                for slot in slots
+                for row in slot.estimates
+            ]
+        )
+        if strays and strays == len(rows) and "ap" not in self.metrics:
+            message = f"none of the {strays} estimates is of a target of {self.dataset.targets_file}"
+        elif strays and "ap" not in self.metrics:
+            self.notes.append(f"{strays} of {len(rows)} estimates are of no target and count for nothing")
+        if message is None:
+            return
+        if self.on_error == "raise":
+            raise DatasetError(f"{self.source}: {message}")
+        self.problems.insert(0, f"{self.source}: {message}")
+        self.notes.append(message)
+
+    def score(self, rows, method, samples, seed) -> Score:
+        slots = self.slots(rows)
+        self.check_conventions(slots, rows)
+        estimates = [row for slot in slots for row in slot.estimates]
+        self.sized = bool(estimates) and all(row.scale is not None for row in estimates)
+        if not self.sized and any(row.scale is not None for row in estimates):
+            self.notes.append("some estimates have no size, so that sizes are left out")
         by_object: dict[int, list[_Slot]] = {}
         for slot in slots:
             by_object.setdefault(slot.row.obj_id, []).append(slot)
@@ -569,11 +679,10 @@ class _Job:
         precision = self.precision(rows) if "ap" in self.metrics else {}
         return _summarise(self, slots, rows, precision, method, samples, seed)
 
-    def slots(self, rows: list[ResultRow], scales: Sequence[float] | None) -> list[_Slot]:
-        estimates: dict[tuple[int, int, int], list[tuple[ResultRow, float]]] = {}
-        for index, row in enumerate(rows):
-            scale = math.nan if scales is None else float(scales[index])
-            estimates.setdefault((row.scene_id, row.im_id, row.obj_id), []).append((row, scale))
+    def slots(self, rows: list[ResultRow]) -> list[_Slot]:
+        estimates: dict[tuple[int, int, int], list[ResultRow]] = {}
+        for row in rows:
+            estimates.setdefault((row.scene_id, row.im_id, row.obj_id), []).append(row)
         found = []
         for target in self.targets:
             try:
@@ -595,8 +704,8 @@ class _Job:
             valid = np.zeros(len(truths), bool)
             valid[best] = True
             mine = estimates.get((target.scene_id, target.im_id, target.obj_id), [])
-            mine = sorted(mine, key=lambda pair: -pair[0].score)[: target.count]
-            found.append(_Slot(target, camera, width, truths, valid, [r for r, _ in mine], [s for _, s in mine]))
+            mine = sorted(mine, key=lambda row: -row.score)[: target.count]
+            found.append(_Slot(target, camera, width, truths, valid, mine))
         return found
 
     def measure(self, obj_id: int, slots: list[_Slot], metrics: Sequence[str]) -> None:
@@ -613,6 +722,11 @@ class _Job:
         measured["rotation"], measured["translation"] = surface.rotation, surface.translation
         if {"add", "add_s"} & set(metrics):
             measured["add"], measured["add_s"] = average_distances(model, truths, found)
+        if self.sized:
+            scales = np.array([s.estimates[e].scale for s, e, _ in pairs], np.float64)
+            measured["sized_mssd"], measured["sized_add"] = sized_distances(
+                model, truths, found, scales, nearest=obj_id in self.symmetric
+            )
         place = {(id(slot), e, g): row for row, (slot, e, g) in enumerate(pairs)}
         for slot in slots:
             shape = (len(slot.estimates), len(slot.truths))
@@ -708,7 +822,7 @@ class _Job:
                 counts[obj] += int(valid.sum())
                 if mine and there:  # the toolkit drops estimates of objects that are not in the image at all
                     row = TargetRow(scene, image, obj, len(there))
-                    slots[obj].append(_Slot(row, camera, width, there, valid, mine, [math.nan] * len(mine)))
+                    slots[obj].append(_Slot(row, camera, width, there, valid, mine))
         table = {"mssd": [], "mspd": []}
         for obj in sorted(objects):
             if counts[obj] == 0:
@@ -746,7 +860,7 @@ def detection_precision(
 def _hits(slot: _Slot, name: str, diameter: float) -> np.ndarray:
     """True positives of a target at every threshold: [10], or [10, 10] for VSD (tolerance, threshold)."""
     thresholds = errors.PIXEL_THRESHOLDS if name == "mspd" else errors.THRESHOLDS
-    table = slot.mssd / diameter if name == "mssd" else getattr(slot, name)
+    table = getattr(slot, name) / (1.0 if name in ("mspd", "vsd") else diameter)
     if table.ndim == 2:
         table = table[..., None]
     scores = np.array([e.score for e in slot.estimates])
@@ -763,6 +877,12 @@ def _hits(slot: _Slot, name: str, diameter: float) -> np.ndarray:
 def _summarise(job: _Job, slots: list[_Slot], rows, precision, method, samples, seed) -> Score:
     names = [m for m in ("mssd", "mspd", "vsd") if m in job.metrics]
     hits = {n: np.stack([_hits(s, n, job.infos[s.row.obj_id].diameter).reshape(-1) for s in slots]) for n in names}
+    instances = _instances(slots)
+    sized: dict[str, np.ndarray] = {}
+    if job.sized:
+        for name, attribute in (("mssd", "sized_mssd"), ("add_or_s", "sized_add")):
+            sized[name] = np.stack([_hits(s, attribute, job.infos[s.row.obj_id].diameter) for s in slots])
+        sized |= _size_hits(slots, instances)
     counts = np.array([s.row.count for s in slots])
     images = {image: i for i, image in enumerate(dict.fromkeys((s.row.scene_id, s.row.im_id) for s in slots))}
     of_image = np.array([images[s.row.scene_id, s.row.im_id] for s in slots])
@@ -782,6 +902,8 @@ def _summarise(job: _Job, slots: list[_Slot], rows, precision, method, samples, 
             int(counts[chosen].sum()),
             recalls,
             _bootstrap(hits, counts, of_image, chosen, samples, seed, job.metrics),
+            _recalls(sized, counts, chosen, job.metrics),
+            _bootstrap(sized, counts, of_image, chosen, samples, seed, job.metrics),
         )
 
     everything = np.ones(len(slots), bool)
@@ -795,13 +917,13 @@ def _summarise(job: _Job, slots: list[_Slot], rows, precision, method, samples, 
             f"all frames, without {told}": summary(trusted),
         }
     of_object = np.array([s.row.obj_id for s in slots])
-    instances = _instances(slots)
     found = [i for i in instances if i.found]
     per_object: dict[int, dict[str, float]] = {}
     for obj in sorted(set(of_object.tolist())):
         mine = [i for i in found if i.obj_id == obj]
         entry: dict[str, float] = {"targets": float(counts[of_object == obj].sum())}
         entry |= _recalls(hits, counts, of_object == obj, job.metrics)
+        entry |= {f"sized_{k}": v for k, v in _recalls(sized, counts, of_object == obj, job.metrics).items()}
         entry |= _medians(mine)
         per_object[obj] = entry
     seconds = {(r.scene_id, r.im_id): r.time for r in rows if r.time >= 0}
@@ -833,7 +955,8 @@ def _recalls(hits, counts, chosen, metrics) -> dict[str, float]:
 
 def _mean_recall(recalls: dict[str, Any]) -> dict[str, Any]:
     """BOP's AR, where all three of its metrics are there."""
-    return {"ar": sum(recalls[n] for n in ("mssd", "mspd", "vsd")) / 3} if len(recalls) == 3 else {}
+    names = ("mssd", "mspd", "vsd")
+    return {"ar": sum(recalls[n] for n in names) / 3} if set(names) <= set(recalls) else {}
 
 
 def _bootstrap(hits, counts, of_image, chosen, samples, seed, metrics) -> dict[str, tuple[float, float]]:
@@ -880,10 +1003,22 @@ def _instances(slots: list[_Slot]) -> list[Instance]:
                     float(slot.add_s[e, g]) if slot.add_s.size else math.nan,
                     float(slot.rotation[e, g]),
                     float(slot.translation[e, g]),
-                    abs(slot.scales[e] - 1),
+                    math.nan if (scale := slot.estimates[e].scale) is None else abs(scale - 1),
+                    float(slot.sized_mssd[e, g]) if slot.sized_mssd.size else math.nan,
+                    float(slot.sized_add[e, g]) if slot.sized_add.size else math.nan,
                 )
             )
     return found
+
+
+def _size_hits(slots: list[_Slot], instances: list[Instance]) -> dict[str, np.ndarray]:
+    """For each target the instances whose size is right, one table [slots, 1] for each tolerance."""
+    places = {(s.row.scene_id, s.row.im_id, s.row.obj_id): i for i, s in enumerate(slots)}
+    tables = {f"size_{round(100 * x)}": np.zeros((len(slots), 1), np.int64) for x in errors.SIZE_TOLERANCES.tolist()}
+    for one in instances:
+        for table, tolerance in zip(tables.values(), errors.SIZE_TOLERANCES.tolist(), strict=True):
+            table[places[one.scene_id, one.im_id, one.obj_id], 0] += one.scale < tolerance
+    return tables
 
 
 def _medians(instances: list[Instance]) -> dict[str, float]:
@@ -932,6 +1067,16 @@ def _table(found: Score) -> str:
         "Recalls in %; brackets: 95 % bootstrap over images. One frame per scene: the first."
         + (" Without SCENE/IMAGE: its annotation is in doubt." if found.without else ""),
     ]
+    if found.all_frames.sized:
+        rows = [["", *SIZED.values()]]
+        for title, part in found.parts().items():
+            rows.append([title, *(_percent(part.sized[n], part.sized_intervals.get(n)) for n in SIZED)])
+        lines += [
+            "",
+            "With the model at its estimated size, which the recalls above do not see (%; in true diameters):",
+            *_columns(rows),
+            "",
+        ]
     if found.medians:
         parts = [
             f"rotation {found.medians['rotation_deg']:.1f}°",
@@ -1034,7 +1179,8 @@ def evaluate(
             ``shared_seconds`` (work that another estimator has done for it) are added to it; sentences in ``notes`` go
             under the table.
         results_dir: gets ``results.jsonl`` (a line per finished image: the record that resuming trusts),
-            ``METHOD_DATASET-SPLIT.csv``, ``score.json`` and ``score.txt``.
+            ``METHOD_DATASET-SPLIT.csv`` in BOP's form, the same with a column for the size (``.sized.csv``),
+            ``score.json`` and ``score.txt``.
         settings: what the results depend on (configuration, weights, meshes), as plain JSON; a folder with results of
             other settings is refused.
         detections: masks to use; default: the annotated visible masks.
@@ -1101,6 +1247,7 @@ def evaluate(
                 journal.append(image, rows, seconds, None)
         ordered = [pair for image in images for pair in journal.done[image].rows]
         write_results(results, [row for row, _ in ordered])
+        write_results(sized_path(results), [row for row, _ in ordered], scales=[scale for _, scale in ordered])
         failed = [f"scene {s}, image {i}: {error}" for s, i in images if (error := journal.done[s, i].error)]
         notes = [*getattr(estimator, "notes", ()), *_alignment_notes(alignments)]
         if failed:
@@ -1235,6 +1382,12 @@ def _check_rows(rows: list[tuple[ResultRow, float]]) -> None:
     for row, scale in rows:
         if not np.isfinite([row.score, *row.rotation, *row.translation, scale]).all():
             raise ValueError(f"the estimate of object {row.obj_id} is not finite")
+        if not scale > 0:
+            raise ValueError(f"the size of the estimate of object {row.obj_id} is not positive: {scale:g}")
+        try:
+            check_rotation(row.rotation)
+        except ValueError as error:
+            raise ValueError(f"the estimate of object {row.obj_id}: {error}") from None
 
 
 def _bar(items: Any, show: bool, unit: str, *, done: int = 0, total: int | None = None) -> Any:
@@ -1256,7 +1409,37 @@ def _aligned(row: ResultRow, alignment: Alignment | None) -> ResultRow:
         return row
     pose = _pose(row)
     moved = alignment.apply(Estimate(row.obj_id, row.score, pose.rotation, pose.translation, alignment.scale))
-    return as_row(row.scene_id, row.im_id, moved, row.time)
+    return replace(as_row(row.scene_id, row.im_id, moved, row.time), line=row.line, scale=row.scale)
+
+
+def _identity(row: ResultRow) -> tuple:
+    """What tells an estimate from others."""
+    return row.scene_id, row.im_id, row.obj_id, row.score, row.rotation, row.translation
+
+
+def _suspect_conventions(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> str | None:
+    """What is wrong with all of a file's translations, given each with that of the annotation (metres): in words, or
+    None. Only what no method that merely fails can do: three quarters of them off by the same power of ten, or behind
+    the camera at the right distance."""
+    if not pairs:
+        return None
+    estimates, truths = np.stack([e for e, _ in pairs]), np.stack([t for _, t in pairs])
+    ratio = np.linalg.norm(estimates, axis=-1) / np.maximum(np.linalg.norm(truths, axis=-1), 1e-9)
+    middle = float(np.median(ratio))
+    power = round(math.log10(middle)) if middle > 0 else 0
+    alike = np.mean(np.abs(np.log(np.maximum(ratio, 1e-12) / 10.0**power)) < math.log(1.25)) > 0.75
+    if abs(power) >= 2 or (power and len(pairs) >= 3):
+        if alike:
+            factor = f"{10 ** abs(power)} times too {'small' if power < 0 else 'large'}"
+            lengths = [f"{np.median(np.linalg.norm(x, axis=-1)) / MM:.4g}" for x in (estimates, truths)]
+            unit = "; it seems to be in metres" if power == -3 else ""
+            return (
+                f"the translations are some {factor} (median length {lengths[0]}, annotated {lengths[1]} mm): t must "
+                f"be in millimetres{unit}"
+            )
+    elif len(pairs) >= 3 and alike and np.mean((estimates[:, 2] < 0) & (truths[:, 2] > 0)) > 0.75:
+        return "the objects are behind the camera (z below 0): poses must be in OpenCV axes, x right, y down, z ahead"
+    return None
 
 
 def _symmetric(
