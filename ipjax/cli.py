@@ -865,7 +865,7 @@ examples:
         "--sizes",
         type=Path,
         metavar="CSV",
-        help="the same with a column scale (default: CSV's .sized.csv, if it is there)",
+        help="the same with a column scale (default: CSV's .sized, if it is there)",
     )
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument("--split", default="test", help="which split (default test)")

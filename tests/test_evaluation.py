@@ -179,7 +179,7 @@ def test_sizes_are_kept_beside_the_bop_file_and_found_there(small, tmp_path):
     path = bop.write_results(tmp_path / "mine_small-test.csv", rows)
     plain = path.read_text()
     beside = bop.write_results(bop.sized_path(path), rows, scales=scales)
-    assert beside.name == "mine_small-test.sized.csv" and path.read_text() == plain
+    assert beside.name == "mine_small-test.sized" and path.read_text() == plain
     assert beside.read_text().splitlines()[1] == f"{plain.splitlines()[1]},1.03"  # BOP's row and a column
     assert [row.scale for row in bop.read_results(beside)] == scales and bop.read_results(beside) == rows
     names = ("mssd", "mspd")

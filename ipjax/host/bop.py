@@ -747,8 +747,8 @@ def write_results(path: str | Path, rows: Iterable[ResultRow], *, scales: Sequen
 
 
 def sized_path(path: str | Path) -> Path:
-    """Where the sizes of a BOP result file are kept: beside it, under ``.sized.csv``."""
-    return Path(path).with_suffix(".sized.csv")
+    """Where the sizes of a BOP result file are kept: beside it, as ``.sized``, which nobody takes for a BOP file."""
+    return Path(path).with_suffix(".sized")
 
 
 def as_row(scene_id: int, im_id: int, estimate: Estimate, time: float = -1.0) -> ResultRow:

@@ -446,7 +446,7 @@ def score(
         scales: the estimated scale (estimated over true size) of each row; a BOP file cannot hold it. With sizes, the
             score has `Summary.sized`, which BOP's figures cannot see.
         sizes: the file with the sizes of a result file, as `evaluate` writes it; True: the one beside it, if there is
-            one (``.sized.csv``); False: none.
+            one (``.sized``); False: none.
         symmetric: objects for which ADD(-S) is ADD-S; default: YCB-V's list, or those with symmetries.
         delta: VSD's visibility tolerance, metres (ITODD: 0.005).
         on_error: "raise" stops at the first damaged file or row; "skip" goes on and lists them in ``problems``.
@@ -1179,7 +1179,7 @@ def evaluate(
             ``shared_seconds`` (work that another estimator has done for it) are added to it; sentences in ``notes`` go
             under the table.
         results_dir: gets ``results.jsonl`` (a line per finished image: the record that resuming trusts),
-            ``METHOD_DATASET-SPLIT.csv`` in BOP's form, the same with a column for the size (``.sized.csv``),
+            ``METHOD_DATASET-SPLIT.csv`` in BOP's form, the same with a column for the size (``.sized``),
             ``score.json`` and ``score.txt``.
         settings: what the results depend on (configuration, weights, meshes), as plain JSON; a folder with results of
             other settings is refused.
