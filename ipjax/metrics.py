@@ -291,21 +291,20 @@ class SizedErrors(eqx.Module):
 
 
 def sized_errors(
+    diameter: float | Float[Array, ""],
     points: Float[Array, "n 3"],
     symmetries: Similarity,
     truth: Similarity,
     estimate: Similarity,
-    *,
-    diameter: float | Float[Array, ""],
 ) -> SizedErrors:
     """What BOP's errors do not see: its files hold no size, so that its scores move the model rigidly, and a pose whose
     size is wrong by a third is perfect. Here the estimate maps the model's points with its own scale.
 
     Args:
+        diameter: of the points, in their unit; the truth's scale makes it the true diameter.
         points: of the model.
         symmetries: one leading axis, see ``discretise_symmetries``.
         truth, estimate: ``camera_from_object``; only the ratio of their scales counts as size.
-        diameter: of the points, in their unit; the truth's scale makes it the true diameter.
 
     For the true rotation and a size wrong by a factor f about the point c, MSSD is |f − 1| · max |x − c| and ADD
     |f − 1| · mean |x − c|, over the true diameter (by symmetries that keep c). BOP's thresholds (``THRESHOLDS``) and

@@ -164,11 +164,11 @@ def test_sized_errors_are_those_of_the_metrics(small):
         model = evaluation.Model.load(small, one.obj_id)
         pose = lambda R, t, s: Similarity(*(jnp.asarray(x, jnp.float32) for x in (R, t, s)))
         expected = metrics.sized_errors(
+            model.diameter,
             jnp.asarray(model.points, jnp.float32),
             pose(*model.symmetries, np.ones(len(model.rotations))),
             pose(truth.rotation, truth.translation, 1.0),
             pose(np.reshape(row.rotation, (3, 3)), np.multiply(row.translation, 1e-3), 1.07),
-            diameter=model.diameter,
         )
         assert one.sized_mssd / model.diameter == pytest.approx(float(expected.mssd), rel=1e-3)
         assert one.sized_add / model.diameter == pytest.approx(float(expected.add_s), rel=1e-3)

@@ -246,7 +246,7 @@ def test_a_wrong_size_alone_is_an_error_as_large_as_the_size_is_wrong(seed, fact
     estimate = Similarity(
         truth.rotation, truth.translation + size * (1 - factor) * kept, jnp.asarray(factor * size, jnp.float32)
     )
-    found = sized(POINTS, NONE, truth, estimate, diameter=0.4)
+    found = sized(0.4, POINTS, NONE, truth, estimate)
     arms = np.linalg.norm(np.asarray(POINTS) - centre, axis=-1) / 0.4
     np.testing.assert_allclose(found.mssd, abs(factor - 1) * arms.max(), rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(found.add, abs(factor - 1) * arms.mean(), rtol=1e-3, atol=1e-5)
@@ -263,7 +263,7 @@ def test_sized_errors_forgive_symmetries_and_nothing_else(seed, grow):
     for rotation in (truth.rotation, truth.rotation @ turn):
         for factor in (1 + grow, 1 + grow + 0.1):
             estimate = Similarity(rotation, truth.translation, jnp.asarray(factor, jnp.float32))
-            errors.append(float(sized(POINTS, symmetries, truth, estimate, diameter=0.4).mssd))
+            errors.append(float(sized(0.4, POINTS, symmetries, truth, estimate).mssd))
     reach = float(jnp.max(jnp.linalg.norm(POINTS, axis=-1))) / 0.4
     np.testing.assert_allclose(errors, [grow * reach, (grow + 0.1) * reach] * 2, rtol=1e-3, atol=1e-5)
 
@@ -273,7 +273,7 @@ def test_sized_errors_are_bops_at_the_true_size_and_can_be_mapped():
     rows, truth, estimate = rows_of(2)
     points, symmetries = jnp.asarray(ERRORS["obj2_pts"]), poses(*symmetries_of(2))
     diameter = float(ERRORS["obj2_diameter"])
-    run = lambda t, e: metrics.sized_errors(points, symmetries, t, e, diameter=diameter)
+    run = lambda t, e: metrics.sized_errors(diameter, points, symmetries, t, e)
     found = jax.jit(jax.vmap(run))(truth, estimate)
     for name, golden in (("mssd", "mssd"), ("add", "add"), ("add_s", "adi")):
         np.testing.assert_allclose(getattr(found, name), ERRORS[golden][rows] / diameter, rtol=1e-4, atol=1e-5)
