@@ -285,9 +285,8 @@ def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
 def _parse(text: str) -> Any:
     if not text.strip():
         raise ValueError("the file is empty")
-    words = [word for word in re.split(r"[\s,;]+", text.strip()) if word]
-    try:
-        return [float(word) for word in words]
+    try:  # no more than could be a camera, with some to count
+        return [float(word) for word in re.split(r"[\s,;]+", text.strip(), maxsplit=20) if word]
     except ValueError:
         pass
     entry = parse(text)

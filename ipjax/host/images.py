@@ -372,10 +372,14 @@ def _wide_tiff(path: Path) -> np.ndarray | None:
 
     _check_upright(tags[_ORIENTATION], path)
     check_budget(3 * (bits // 8) * width * height, f"{path}: an image of {width} × {height} pixels")
+    level = cv2.utils.logging.getLogLevel()
     try:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # it prints what it cannot read
         depth = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         depth = None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if depth is None or depth.shape[:2] != (height, width):
         name = {1: "unsigned", 2: "signed", 3: "floating-point"}.get(kind, "unknown")
         raise ValueError(f"{path}: a TIFF of {bits}-bit {name} numbers cannot be read; save it as 16-bit or float32")
