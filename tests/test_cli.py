@@ -362,11 +362,21 @@ def found_case(tmp_path, monkeypatch):
     unit = 0.3 * info.mesh_scale  # its diameter is 0.3 m
     info = dataclasses.replace(info, pictures=np.stack([rgb, rgb]), colours=None, metres_per_unit=unit)
     save(tmp_path / "relief.ipjax", templates, info)
-    for folder in ("rgb", "depth", "mask"):
+    named = dataclasses.replace(info, name="obj_000004", metres_per_unit=unit / 2)  # a mesh file of another unit
+    save(tmp_path / "obj_000004.ipjax", templates, named)
+    for folder in ("rgb", "depth", "mask", "mask_visib"):
         (tmp_path / "scene" / folder).mkdir(parents=True)
     Image.fromarray(rgb).save(tmp_path / "scene" / "rgb" / "000001.png")
     Image.fromarray((depth * 300).round().astype(np.uint16)).save(tmp_path / "scene" / "depth" / "000001.png")
-    Image.fromarray(mask.astype(np.uint8) * 255).save(tmp_path / "scene" / "mask" / "000001.png")
+    # The masks stand in the order of scene_gt.json, which is not that of the objects on the command line.
+    for i, shown in enumerate((mask & False, mask[::-1] & False, mask, mask)):
+        for folder in ("mask", "mask_visib"):
+            path = tmp_path / "scene" / folder / f"000001_{i:06d}.png"
+            Image.fromarray(shown.astype(np.uint8) * 255).save(path)
+    truths = [{"obj_id": number} for number in (9, 2, 4, 9)]
+    shares = [{"visib_fract": share} for share in (0.1, 0.9, 0.9, 0.8)]
+    (tmp_path / "scene" / "scene_gt.json").write_text(json.dumps({"1": truths, "2": truths}))
+    (tmp_path / "scene" / "scene_gt_info.json").write_text(json.dumps({"1": shares, "2": shares}))
     Image.fromarray(rgb).save(tmp_path / "scene" / "rgb" / "000002.png")  # this frame has no depth
     entry = {"cam_K": [focal, 0, centre, 0, focal, centre, 0, 0, 1], "depth_scale": 1.0}
     (tmp_path / "scene" / "scene_camera.json").write_text(json.dumps({"1": entry, "2": entry}))
@@ -376,14 +386,27 @@ def found_case(tmp_path, monkeypatch):
 
 def test_a_folder_of_frames_is_estimated_told_and_drawn(found_case, capfd):
     folder, rotation, translation = found_case
-    words = ["estimate", folder / "relief.ipjax", "--frames", folder / "scene", "-o", folder / "poses.json"]
-    assert run([*map(str, words), "--overlay", str(folder / "pictures")]) == 0
+    objects = [folder / "relief.ipjax", folder / "obj_000004.ipjax"]
+    words = ["estimate", *objects, "--obj-id", 9, "--obj-id", 4, "--frames", folder / "scene"]
+    assert run([*map(str, words), "-o", str(folder / "poses.json"), "--overlay", str(folder / "pictures")]) == 0
     out, error = capfd.readouterr()
     assert "000001: mug: centre" in out and "000002: " in error and "no such file" in error
+    assert error.count("the size found is") == 1 and error.count("image 000001: of 2 of object 9") == 1
     told = json.loads((folder / "poses.json").read_text())
     good, bad = told["frames"]
     assert bad["frame"] == "000002" and "no such file" in bad["error"]
-    (one,) = good["objects"]
+    one, doubted = good["objects"]
+    # Of two instances, the more visible; found by its number in scene_gt.json, not by its place on the command line.
+    assert one["mask"].endswith("mask_visib/000001_000003.png")
+    assert doubted["mask"].endswith("mask_visib/000001_000002.png")
+    # The same answer, but the mesh file says half of the size: less sure, and said so.
+    np.testing.assert_allclose(doubted["camera_from_object"]["matrix"], one["camera_from_object"]["matrix"], atol=1e-6)
+    ratio = doubted["size_mm"]["diameter"] / doubted["size_from_mesh_mm"]["diameter"]
+    assert ratio == pytest.approx(2, rel=0.05)
+    loss = np.exp(-0.5 * (np.log(ratio) / np.log(1.25)) ** 2)
+    assert doubted["confidence"] == pytest.approx(one["confidence"] * loss, rel=1e-3)
+    assert one["present"] and not doubted["present"]
+    assert any("times the 150 mm of its mesh file" in line for line in good["warnings"])
     pose = one["camera_from_object"]
     np.testing.assert_allclose(pose["rotation"], rotation, atol=0.05)
     np.testing.assert_allclose(pose["translation_m"], translation, atol=0.015)
@@ -394,3 +417,46 @@ def test_a_folder_of_frames_is_estimated_told_and_drawn(found_case, capfd):
     picture = np.asarray(Image.open(folder / "pictures" / "000001.png"))
     assert picture.shape[0] >= 900 and picture.shape[1] > 1400 and picture.std() > 20
     assert [path.name for path in (folder / "pictures").iterdir()] == ["000001.png"]
+
+
+def test_a_scene_of_bop_asks_which_mask_is_whose(case, capfd):
+    """Nothing says which of several masks belongs to an object: it is asked, before anything is computed."""
+    scene = case / "scene"
+    for folder in ("rgb", "depth", "mask"):
+        (scene / folder).mkdir(parents=True)
+    (scene / "rgb" / "000007.png").write_bytes((case / "rgb.png").read_bytes())
+    (scene / "depth" / "000007.png").write_bytes((case / "depth.png").read_bytes())
+    (scene / "camera.json").write_bytes((case / "camera.json").read_bytes())
+    for i in range(3):
+        (scene / "mask" / f"000007_{i:06d}.png").write_bytes((case / "mask.png").read_bytes())
+    words = ["estimate", str(case / "mug.ipjax"), "--frames", str(scene)]
+
+    def told(*more: str) -> str:
+        assert run([*words, *more]) == 2
+        out, error = capfd.readouterr()
+        assert out == "" and error.count("\n") == 1
+        return error
+
+    assert "3 masks, and 1 object is wanted: say which mask is whose with --instance" in told()
+    assert "needs a scene_gt.json" in told("--obj-id", "3")
+    assert "once for each object" in told("--instance", "0", "--instance", "1")
+    truth = scene / "scene_gt.json"
+    truth.write_text(json.dumps({"7": [{"obj_id": 2}, {"obj_id": 5}, {"obj_id": 2}]}))
+    assert "it has the objects 2, 5: say with --obj-id which is mug" in told()
+    truth.write_text("[" * 100_000)
+    assert "nested too deeply" in told()
+    truth.write_text(json.dumps({"7": [{"obj": 2}]}))
+    assert "a list of instances with obj_id" in told()
+
+
+@pytest.mark.parametrize("platform", ["cuda", "nonsense"])
+def test_devices_that_are_not_here_are_told_in_one_line(case, platform):
+    environment = os.environ | {"JAX_PLATFORMS": platform}
+    for words in (["doctor"], [*map(str, command(case))]):
+        done = subprocess.run(
+            [sys.executable, "-m", "ipjax", *words], capture_output=True, text=True, timeout=120, env=environment
+        )
+        assert "Traceback" not in done.stdout + done.stderr
+        assert f"JAX_PLATFORMS={platform} asks for devices" in done.stdout + done.stderr
+        assert done.returncode == (1 if words == ["doctor"] else 2)
+        assert done.stderr.count("\n") == (0 if words == ["doctor"] else 1)
