@@ -1,6 +1,8 @@
 """``python -m benchmarks [--only NAME] [--json FILE] [--quick]``: measure on this machine, print the table.
 
-Without ``--only``, all but "query", which compiles whole queries for as long as all others take.
+``--json FILE`` keeps the rows: `benchmarks.table` makes the pages benchmarks/results/cpu_2_cores.md and, of those of
+``--only query``, query_cpu_2_cores.md from them. Without ``--only``, all but "query", which compiles whole queries for
+as long as all others take.
 ``--trace FOLDER`` writes a profile of warm estimates instead; https://ui.perfetto.dev opens its ``.json.gz``.
 """
 

@@ -2,7 +2,8 @@
 
 From the paper's recipe to `Config()`, one step added after the other, on scans and on degraded meshes (``--levels``) or
 on a reconstructed one (``--reconstruction``). Settings of each step are written as JSON beside the results, so a step
-can be run alone: ``ipjax evaluate DATA --config FILE``. Killed and called again it goes on. Ends with two tables.
+can be run alone: ``ipjax evaluate DATA --config FILE``. Killed and called again it goes on. Ends with the
+two tables of the page benchmarks/results/ablation.md.
 """
 
 import json

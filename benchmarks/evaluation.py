@@ -4,7 +4,7 @@ In one process, for each data set in BOP layout and each quality of its meshes: 
 classical baseline where Open3D is installed, on the annotated masks. Objects are onboarded once, into the cache or the
 folder that --objects names; the methods share what was loaded and described. Results stay under --output: killed and
 called again it goes on, and results of another state of the code or of other settings are made anew. Ends with the
-page (see `benchmarks.results_page`), in Markdown and HTML.
+page (see `benchmarks.results_page`), in Markdown and HTML: ``make results`` lets it be benchmarks/results/accuracy.md.
 """
 
 import argparse

@@ -41,13 +41,20 @@ def is_telling(row: dict) -> bool:
 
 
 def render(results: dict, short: bool = False) -> str:
-    """One device's results as a heading and a table, of all rows or the most telling ones."""
+    """One device's results as a heading and a table, of all rows or the most telling ones; ``results["stale"]`` says
+    what has changed since, where something has."""
     columns = {name: cell for name, cell in COLUMNS.items() if not short or name in SHORT}
     rows = [row for row in results["rows"] if not short or is_telling(row)]
     lines = [
         f"**{results['device']}** ({results['platform']}, {results['cores']} cores), jax {results['jax']}, "
         f"Python {results['python']}, {results['date']}, commit {results.get('commit', 'unknown')}"
         + (" — quick run, small sizes" if results["quick"] else ""),
+        *([f"\n**Stale**: {results['stale']}"] if "stale" in results else []),
+        *(
+            []
+            if short
+            else ["\nMeasured by `python -m benchmarks --json FILE`, written by `python -m benchmarks.table FILE`."]
+        ),
         "",
         "| " + " | ".join(columns) + " |",
         "|" + " --- |" * len(columns),

@@ -2,6 +2,8 @@
 
     python -m benchmarks.triposr [--dtype bfloat16] [--resolution 256]
 
+Prints the rows of the page benchmarks/results/triposr_cpu_2_cores.md.
+
 The mesh means nothing; shapes, time and memory do. Times include compilation, as one photo on a fresh process does.
 """
 

@@ -1,6 +1,7 @@
 """The README's Python runs as it stands there, and its commands exist."""
 
 import functools
+import json
 import re
 from pathlib import Path
 
@@ -108,3 +109,74 @@ def test_make_targets_exist():
     assert targets
     for target in targets:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"make {target}"
+
+
+PAGES = README.parent / "benchmarks" / "results"
+
+
+def read_pages() -> str:
+    """All pages of results."""
+    return "\n".join(page.read_text() for page in sorted(PAGES.glob("*.md")))
+
+
+def find_row(text: str, *cells: str) -> list[str]:
+    """The first row of a Markdown table that begins with these cells."""
+    for line in text.splitlines():
+        found = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        if line.startswith("|") and found[: len(cells)] == list(cells):
+            return found
+    raise AssertionError(f"no row {' | '.join(cells)}")
+
+
+def test_every_accuracy_figure_is_the_page_s():
+    """The table's rows are those of the page that a command prints, method by method and column by column."""
+    page = (PAGES / "accuracy.md").read_text()
+    section = page[page.index("\n## ycbv, scans") :]
+    section = section[: section.index("\n## ", 5)]
+    table = README.read_text().split("| | AR |", 1)[1].split("\n\n")[0].splitlines()[2:]
+    methods = {"`Config()`, with the encoder": "ipjax-default", "`Config.paper()`": "ipjax-paper"}
+    assert {line.strip("|").split("|")[0].strip() for line in table} == set(methods)
+    for line in table:
+        name, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+        all_frames = find_row(section[section.index("### All frames:") :], methods[name])
+        medians = find_row(section[section.index("### Medians") :], methods[name])
+        assert cells[0] == all_frames[-1].split()[0]
+        assert [c.split()[0].rstrip("°") for c in cells[1:4]] == medians[1:4]
+        assert cells[4] == f"{float(medians[7]):.0f} % of targets"
+
+
+def test_every_figure_stands_on_a_page():
+    """Whatever has a decimal point in README's chapter of results is a figure of a page, or of the table above it."""
+    text = README.read_text()
+    chapter = text[text.index("## How well, how fast") : text.index("## When something does not work")]
+    figures = set(re.findall(r"(?<![\w.,-])\d+\.\d+(?![\w.])", chapter.split("<!-- benchmarks -->")[0]))
+    figures |= set(re.findall(r"(?<![\w.,-])\d+\.\d+(?![\w.])", chapter.split("<!-- /benchmarks -->")[1]))
+    assert len(figures) > 10
+    there = set(re.findall(r"\d+\.\d+", read_pages()))
+    assert sorted(figures - there) == []
+
+
+def test_tables_of_times_are_those_of_the_results():
+    """What stands between the marks is what `benchmarks.table` makes of the files beside the pages."""
+    from benchmarks.table import BEGIN, END, render
+
+    inside = README.read_text().split(BEGIN, 1)[1].split(END, 1)[0]
+    files = [json.loads((PAGES / name).read_text()) for name in ("cpu_2_cores.json", "query_cpu_2_cores.json")]
+    assert inside.strip() == "\n".join(render(results, short=True) for results in files).strip()
+    for path, results in zip(("cpu_2_cores.md", "query_cpu_2_cores.md"), files, strict=True):
+        assert (PAGES / path).read_text() == render(results)
+
+
+@pytest.mark.parametrize("page", sorted(PAGES.glob("*.md")), ids=lambda page: page.name)
+def test_a_page_names_its_command_and_its_commit(page):
+    """A command that exists, and a commit; README names both the page and the command."""
+    text, manual = page.read_text(), README.read_text()
+    modules = re.findall(r"python -m (benchmarks[.\w]*)", text)
+    assert modules and re.search(r"[cC]ommit `?[0-9a-f]{7,}", text)
+    for module in modules:
+        parts = module.split(".")
+        assert (README.parent / Path(*parts)).with_suffix(".py").is_file() or (README.parent / Path(*parts)).is_dir()
+    assert f"(benchmarks/results/{page.name})" in manual
+    assert f"python -m {modules[0]}" in manual
+    if "**Stale**" in text:
+        assert "have not been measured again" in " ".join(manual.split())
