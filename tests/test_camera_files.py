@@ -198,7 +198,8 @@ def test_no_lens_is_dropped(name, value):
     [
         {"width": 640, "height": 480}, {"w": 640, "h": 480}, {"image_width": "640", "image_height": "480"},
         {"imageWidth": 640, "imageHeight": 480}, {"img_w": 640, "img_h": 480}, {"resolution": [640, 480]},
-        {"image_size": [640, 480]}, {"image_size": {"width": 640, "height": 480}}, {"size": "640 x 480"},
+        {"image_size": [640, 480]}, {"image_size": [480, 640]}, {"image_size": {"width": 640, "height": 480}},
+        {"size": "640 x 480"},
         {"cols": 640, "rows": 480}, {"shape": [480, 640]}, {"frame_width": 640, "frame_height": 480},
         {"resolution_x": 640, "resolution_y": 480}, {"width_px": 640, "height_px": 480},
     ],

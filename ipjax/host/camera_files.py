@@ -409,7 +409,7 @@ def _find(entry: dict) -> _Fields | None:
 def _from_fields(fields: _Fields) -> Intrinsics:
     matrix = _read_matrix(fields)
     lens, coefficients = _read_lens(fields)
-    size = _read_size(fields)
+    size = _read_size(fields, matrix)
     scale = fields.take(re.compile(r"^depthscale$"))
     skew = fields.take(re.compile(r"^skew$"))
     if skew is not None:
@@ -531,7 +531,7 @@ def _says_something(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and value != 0
 
 
-def _read_size(fields: _Fields) -> tuple[int, int] | None:
+def _read_size(fields: _Fields, matrix: np.ndarray) -> tuple[int, int] | None:
     sizes = []
     width, height = fields.take(_WIDTH), fields.take(_HEIGHT)
     if width is not None and height is not None:
@@ -544,7 +544,10 @@ def _read_size(fields: _Fields) -> tuple[int, int] | None:
             inner = _Fields(pair)
             pair = [inner.take(_WIDTH), inner.take(_HEIGHT)]
         if isinstance(pair, list) and len(pair) >= 2 and None not in pair[:2]:
-            sizes.append(tuple(pair[1::-1]) if pattern is _SHAPE else tuple(pair[:2]))
+            pair = pair[:2]
+            if pattern is _SHAPE or _is_height_first(pair, matrix):
+                pair = pair[::-1]
+            sizes.append(tuple(pair))
     known = []
     for pair in sizes:
         size = _numbers(list(pair), "the image size").reshape(-1)
@@ -553,6 +556,15 @@ def _read_size(fields: _Fields) -> tuple[int, int] | None:
     if len(set(known)) > 1:
         raise ValueError(f"it names two image sizes, {known[0][0]} × {known[0][1]} and {known[1][0]} × {known[1][1]}")
     return known[0] if known else None
+
+
+def _is_height_first(pair: list, matrix: np.ndarray) -> bool:
+    """Whether two numbers of a list are height and width, as arrays have them: the principal point is in the middle."""
+    size = _numbers(pair, "the image size").reshape(-1)
+    if size.size != 2 or not (size > 0).all():
+        return False
+    as_listed, turned = (np.abs(matrix[:2, 2] / order - 0.5).max() for order in (size, size[::-1]))
+    return bool(turned < 0.06 < as_listed)
 
 
 def _cut_and_binned(camera: Intrinsics, fields: _Fields) -> Intrinsics:

@@ -200,7 +200,7 @@ def _cut(values: np.ndarray, colours: np.ndarray | None) -> np.ndarray:
     dark, bright = values <= 0.1 * full, values >= 0.9 * full
     found = values > 0.5 * full
     if not ((values == low) | (values == high)).all():
-        _check_two_kinds(values, dark, bright, found)
+        _check_two_kinds(values, full, dark, bright, found)
     if colours is not None:
         seen = colours[bright].astype(np.float64)
         other = np.abs(seen - np.median(seen, axis=0)).max(axis=-1) > 0.25 * full
@@ -209,8 +209,8 @@ def _cut(values: np.ndarray, colours: np.ndarray | None) -> np.ndarray:
     return found
 
 
-def _check_two_kinds(values: np.ndarray, dark: np.ndarray, bright: np.ndarray, found: np.ndarray) -> None:
-    """Refuse labels and photos: an edge is thin, and compression disturbs what is near an edge only."""
+def _check_two_kinds(values: np.ndarray, full: float, dark: np.ndarray, bright: np.ndarray, found: np.ndarray) -> None:
+    """Refuse labels and photos: labels are flat, an edge is steep, and compression disturbs what is near one only."""
     import cv2
 
     def near(region: np.ndarray, reach: int) -> np.ndarray:
@@ -218,13 +218,15 @@ def _check_two_kinds(values: np.ndarray, dark: np.ndarray, bright: np.ndarray, f
         return cv2.dilate(np.ascontiguousarray(region).view(np.uint8), kernel).view(bool)
 
     between = ~dark & ~bright
-    stray = between & ~(near(dark, 5) & near(bright, 5))
+    smooth = np.ascontiguousarray(values, np.float32)
+    span = cv2.dilate(smooth, np.ones((3, 3))) - cv2.erode(smooth, np.ones((3, 3)))
+    stray = between & (span <= 0.02 * full)
     for side, opposite in ((dark, ~dark), (bright, ~bright)):
         inside = values[side]
         kinds, counts = np.unique(inside, return_counts=True)
         if len(kinds) > 1:
             stray |= side & (values != kinds[counts.argmax()]) & ~near(opposite, 16)
-    mostly_edge = between.sum() > 3 * bright.sum() + 200  # which no object of some pixels' size has
+    mostly_edge = between.sum() > 6 * bright.sum() + 200
     if mostly_edge or stray.sum() > max(8, 0.001 * found.sum()):  # fewer are dirt
         raise ValueError(
             f"the mask has more than two values{_labels(values)}: is it a photo, or labels of several objects? "
