@@ -240,6 +240,11 @@ def test_a_folder_of_ones_own_captures(tmp_path):
     np.testing.assert_allclose(frame.depth, 0.9)
     assert frame.name == "desk"
     assert sorted(t.obj_id for t in targets) == [7, 12]
+    pinhole = {"fx": 10, "fy": 10, "cx": 4, "cy": 3, "depth_scale": 1.0}
+    for more, words in (({"k1": 0.1}, "undistort"), ({"w": 16, "h": 12}, "images of 16 × 12, desk has 8 × 6")):
+        (tmp_path / "camera.json").write_text(json.dumps(pinhole | more))
+        with pytest.raises(DatasetError, match=words):
+            bop.Captures(tmp_path).frame("desk")
     (tmp_path / "camera.json").unlink()
     with pytest.raises(DatasetError, match=r"camera\.json"):
         bop.Captures(tmp_path)

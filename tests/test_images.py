@@ -74,6 +74,7 @@ def test_two_values_are_a_mask_in_every_format(tmp_path, name):
         DISC.astype(np.float16) * 255,
         np.dstack([DISC * np.uint8(200), 0 * X, 0 * X]).astype(np.uint8),  # one colour
         cv2.GaussianBlur(DISC.astype(np.float32), (0, 0), 2),  # probabilities
+        cv2.GaussianBlur(DISC * np.uint8(255), (0, 0), 3),
         (cv2.resize(cv2.resize(DISC * 255.0, (64, 48), interpolation=cv2.INTER_AREA), (128, 96)) + 0.5).astype(
             np.uint8
         ),
@@ -261,8 +262,10 @@ def test_images_that_are_to_be_turned_are_refused_where_others_belong_to_them(tm
         read_mask(store(mask, tmp_path / "m.png", exif=exif))
     with pytest.raises(ValueError, match=rf"EXIF orientation \({turn}\)"):
         read_depth(store((DEPTH * 1000).astype(np.uint16), tmp_path / "d.png", exif=exif))
-    # A photo alone is shown as it is to be shown; with a mask, nobody knows which way up that one is.
+    # A photo alone is shown as it is to be shown, a TIFF too, which Pillow turns by itself. With a mask, nobody knows
+    # which way up that one is.
     assert read_photo(tmp_path / "rgb.png").orientation == turn
+    np.testing.assert_array_equal(read_photo(tmp_path / "rgb.tif").rgb, read_photo(tmp_path / "rgb.png").rgb)
     plain = store(mask, tmp_path / "plain.png")
     for beside in ({"mask": plain}, {"mask": mask}, {"box": (30, 20, 60, 60), "camera": K}):
         with pytest.raises(ValueError, match=rf"EXIF orientation \({turn}\)"):

@@ -446,6 +446,8 @@ class Captures:
             if not (self.root / name).is_dir():
                 raise DatasetError(f"{self.root / name}: no such folder; captures need rgb/, depth/ and camera.json")
         self.intrinsics = _checked(read_camera, self.root / "camera.json")
+        if self.intrinsics.distortion:
+            raise DatasetError(f"{self.root / 'camera.json'}: captures are of a pinhole; undistort the images first")
         self.depth_scale = depth_scale if depth_scale is not None else self.intrinsics.depth_scale
 
     def names(self) -> list[str]:
@@ -455,6 +457,10 @@ class Captures:
     def frame(self, name: str) -> Frame:
         """One image with its depth in metres."""
         rgb = _checked(read_rgb, self._file("rgb", name))
+        size = (rgb.shape[1], rgb.shape[0])
+        if self.intrinsics.size not in (None, size):
+            meant = " × ".join(map(str, self.intrinsics.size or ()))
+            raise DatasetError(f"{self.root}: camera.json is for images of {meant}, {name} has {size[0]} × {size[1]}")
         path = self._file("depth", name)
         depth = _checked(read_depth, path)
         if depth.shape != rgb.shape[:2]:

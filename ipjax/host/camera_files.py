@@ -89,8 +89,8 @@ _COEFFICIENTS = re.compile(
     r"^(lens)?(d|dist|disto|distort|distortions?)(coefficients?|coeffs?|coefs?|params?|parameters?|vector|vec)?$"
     r"|^(coefficients?|coeffs?|coefs?)$"
 )
-_MODEL = re.compile(r"^(lens|lens(model|type)|dist(ortion)?(model|type|name)|projection(model|type|modeltype)?)$")
-_LOOSE_MODEL = re.compile(r"^(model|type|modeltype|modelname)$")  # of the lens, or of the device
+_MODEL = re.compile(r"^(dist(ortion)?(model|type|name)|projection(model|type|modeltype)?)$")
+_LOOSE_MODEL = re.compile(r"^(lens|lens(model|type)|model|type|modeltype|modelname)$")  # or the name of a device
 _ABOUT_LENSES = re.compile(
     r"^([kpsb][1-9]\d?|tau[xy]|cod[xy]|xi|omega|alphac|skew|shear)$"
     r"|dist(or|o$|co|par|vec|$)|coeff|^lens|radial|tangential|fisheye|projectionparam|modelparam"
