@@ -1,7 +1,16 @@
-"""Pinhole geometry: projecting, lifting, and the cameras of crops. Pixel centres are integers (OpenCV, BOP)."""
+"""Pinhole geometry: projecting, lifting, and what cropping, resizing and subsampling an image does to its camera.
 
+Pixel centres are integers (OpenCV, BOP). This is the only place that knows what follows from that: whoever changes an
+image calls :func:`crop`, :func:`resize` or :func:`subsample` for its camera (or its K), and the functions of the same
+names for pixels. Sizes and places are (x, y): width first.
+"""
+
+from typing import TypeVar
+
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
 from ipjax.types import Camera
 
@@ -31,6 +40,78 @@ def point_map(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3
     return unproject(camera, pixels, depth.reshape(-1)).reshape(height, width, 3)
 
 
-def patch_centres(grid: Float[Array, "*b p 2"], patch: int) -> Float[Array, "*b p 2"]:
-    """Pixel coordinates of the centres of patches at (column, row); the first patch's is ((patch − 1) / 2, same)."""
-    return (grid + 0.5) * patch - 0.5
+Pinhole = TypeVar("Pinhole", Camera, np.ndarray)  # a camera in the graph, or a 3 × 3 matrix K on the host
+Pixels = TypeVar("Pixels", jax.Array, np.ndarray)
+Pair = tuple[int | float, int | float]  # (x, y)
+
+
+def crop(camera: Pinhole, first: Pair) -> Pinhole:
+    """The camera of the part of an image that begins at pixel ``first``, which may lie outside."""
+    return _change(camera, *_cropping(first))
+
+
+def resize(camera: Pinhole, before: Pair, after: Pair) -> Pinhole:
+    """The camera of an image that was resized; ``before`` and ``after``: its width and height.
+
+    OpenCV's INTER_AREA and INTER_LINEAR resize so, and PIL: the borders of both images are the same. INTER_NEAREST does
+    not: it moves the image by up to half a pixel of the smaller one.
+    """
+    return _change(camera, *_resizing(before, after))
+
+
+def subsample(camera: Pinhole, step: Pair | int, first: Pair = (0, 0)) -> Pinhole:
+    """The camera of the pixels ``first``, ``first + step``, ``first + 2 step`` …: ``image[first::step]``."""
+    return _change(camera, *_subsampling(step, first))
+
+
+def crop_pixels(pixels: Pixels, first: Pair) -> Pixels:
+    """Where pixels ``… 2`` of an image lie in its part that begins at pixel ``first``."""
+    return _move(pixels, *_cropping(first))
+
+
+def resize_pixels(pixels: Pixels, before: Pair, after: Pair) -> Pixels:
+    """Where pixels ``… 2`` of an image lie once it was resized."""
+    return _move(pixels, *_resizing(before, after))
+
+
+def subsample_pixels(pixels: Pixels, step: Pair | int, first: Pair = (0, 0)) -> Pixels:
+    """Where pixels ``… 2`` of an image lie in ``image[first::step]``."""
+    return _move(pixels, *_subsampling(step, first))
+
+
+# Each of the three moves pixels by a map that is affine on either axis: zoom · pixel + shift.
+
+
+def _cropping(first):
+    return np.ones(2), -np.asarray(first, np.float64)
+
+
+def _resizing(before, after):
+    zoom = np.asarray(after, np.float64) / np.asarray(before, np.float64)
+    return zoom, 0.5 * zoom - 0.5  # the borders stay, at −½ and at the size less ½
+
+
+def _subsampling(step, first):
+    zoom = 1 / np.broadcast_to(np.asarray(step, np.float64), 2)
+    return zoom, -zoom * np.asarray(first, np.float64)
+
+
+def _move(pixels, zoom, shift):
+    return pixels * zoom.astype(pixels.dtype) + shift.astype(pixels.dtype)
+
+
+def _change(camera, zoom, shift):
+    if isinstance(camera, Camera):
+        return Camera(camera.focal * zoom.astype(camera.focal.dtype), _move(camera.centre, zoom, shift))
+    return np.array([[zoom[0], 0, shift[0]], [0, zoom[1], shift[1]], [0, 0, 1]]) @ camera
+
+
+def mostly(cover: Float[Array, "h w"] | Float[np.ndarray, "h w"]) -> Bool[Array, "h w"] | Bool[np.ndarray, "h w"]:
+    """The pixels of which at least half are covered, as a mask was averaged.
+
+    Of those that are covered by exactly half, which are many where an image was halved, every other one: all of them
+    would let the mask grow by a quarter of a pixel on every side.
+    """
+    height, width = cover.shape
+    odd = np.indices((height, width)).sum(0) % 2
+    return cover > np.where(odd, 0.501, 0.499).astype(cover.dtype)

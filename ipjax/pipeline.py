@@ -11,6 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from ipjax.alignment import align
+from ipjax.cameras import mostly, resize
 from ipjax.confidence import covariance, find_rival, loosest_turn, pair_information, probability
 from ipjax.config import Config
 from ipjax.features import identity_of, lift, object_features
@@ -195,20 +196,23 @@ class _Scene(eqx.Module):
     mask: Bool[Array, "g g"]
 
     def __init__(self, query: Query, grid: int, contour: int):
-        side = query.view.depth.shape[0]
-        cell = side / grid
-        points, cover = lift(query.view, grid, grid, 0.05)
-        camera = Camera(query.view.camera.focal / cell, (query.view.camera.centre + 0.5) / cell - 0.5)
-        nearest = np.floor((np.arange(grid) + 0.5) * cell).astype(np.int32)
-        self.depth = query.view.depth[nearest[:, None], nearest]
-        self.mask = query.view.mask[nearest[:, None], nearest]
+        view, side = query.view, query.view.depth.shape[0]
+        camera = resize(view.camera, (side, side), (grid, grid))
+        covered = jnp.mean(view.mask.astype(view.depth.dtype).reshape(grid, side // grid, grid, -1), axis=(1, 3))
+        self.mask = mostly(covered)
+        # Of a cell that the object shares with what is behind it or before it, the depth of either alone.
+        of_both = lambda mask: lift(eqx.tree_at(lambda v: v.mask, view, mask), grid, grid, 0.05)
+        points, share = jax.vmap(of_both)(jnp.stack([view.mask, ~view.mask]))
+        known = (share > 0.3).reshape(2, grid, grid)
+        depth = jnp.where(known, points[..., 2].reshape(2, grid, grid), 0)
+        self.depth = jnp.where(self.mask, depth[0], depth[1])
         self.cloud = Cloud(
-            points.reshape(grid, grid, 3),
-            (cover > 0.3).reshape(grid, grid),
+            points[0].reshape(grid, grid, 3),
+            known[0],
             camera,
             self.mask,
             self.depth,
-            trace_contour(self.mask, self.depth, 0.1 * _extent(self.mask, self.depth, camera), contour),
+            trace_contour(covered, self.depth, 0.1 * _extent(self.mask, self.depth, camera), contour),
         )
 
 

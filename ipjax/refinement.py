@@ -24,7 +24,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from ipjax.cameras import project
+from ipjax.cameras import mostly, project
 from ipjax.config import RefineConfig
 from ipjax.types import Camera, Pairs, Similarity, Surface
 
@@ -38,16 +38,23 @@ class Contour(eqx.Module):
 
 
 def trace_contour(
-    mask: Bool[Array, "h w"], depth: Float[Array, "h w"], nearer: Float[Array, ""] | float, count: int
+    cover: Float[Array, "h w"] | Bool[Array, "h w"],
+    depth: Float[Array, "h w"],
+    nearer: Float[Array, ""] | float,
+    count: int,
 ) -> Contour:
-    """About ``count`` points spread over the border between a mask and what lies around it.
+    """About ``count`` points spread over the border between an object and what lies around it.
 
     Args:
-      depth: metres, 0 = unknown. What is by ``nearer`` before the mask's depth beside it cuts the object: the border
+      cover: the share of each cell that the object covers, or a mask. The border runs where it is one half, found
+        between cells: on either axis, so that its points are off to neither side whatever its direction.
+      depth: metres, 0 = unknown. What is by ``nearer`` before the object's depth beside it cuts the object: the border
         is its own there, and left out, as is the border of the image.
       count: where the whole border is shorter, the remaining points are not valid.
     """
-    height, width = mask.shape
+    height, width = cover.shape
+    cover = cover.astype(depth.dtype)
+    mask = mostly(cover)
     reach = 2  # cells that the normals are smoothed over, and that occluders are looked for in
 
     def window(image, radius, combine, beyond):
@@ -60,25 +67,34 @@ def trace_contour(
     before = ~mask & (depth > 0) & jnp.isfinite(of_object) & (depth < of_object - nearer)
     cut = window(before, 1, jnp.logical_or, False)
 
-    # Edge padding: at the image's border the mask goes on.
-    smooth = jnp.pad(mask.astype(depth.dtype), reach + 1, mode="edge")
+    # Edge padding: at the image's border the object goes on.
+    smooth = jnp.pad(cover, reach + 1, mode="edge")
     binomial = np.array([1, 4, 6, 4, 1], np.float32) / 16
     smooth = jnp.sum(jnp.stack([w * smooth[i : i + height + 2] for i, w in enumerate(binomial)]), axis=0)
     smooth = jnp.sum(jnp.stack([w * smooth[:, i : i + width + 2] for i, w in enumerate(binomial)]), axis=0)
     slope = jnp.stack([smooth[1:-1, :-2] - smooth[1:-1, 2:], smooth[:-2, 1:-1] - smooth[2:, 1:-1]], axis=-1)
-    outward = slope / jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True) + 1e-12)
 
     row, column = np.mgrid[:height, :width]
-    cell = jnp.asarray(np.stack([column, row], axis=-1), depth.dtype)
-    edge, place = jnp.zeros((height, width), bool), cell
-    around = jnp.pad(mask, 1, mode="edge")
-    for right, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        leaves = mask & ~around[1 + down : 1 + down + height, 1 + right : 1 + right + width]
-        place = jnp.where((leaves & ~edge)[..., None], cell + jnp.array([right / 2, down / 2], cell.dtype), place)
-        edge |= leaves
-    spread = ((row * 7919 + column * 104729) % 4093).astype(np.int32)  # a fixed shuffle: neighbours lie far apart
-    rank, chosen = lax.top_k(jnp.where(edge & ~cut, spread + 1, 0).reshape(-1), min(count, height * width))
-    return Contour(place.reshape(-1, 2)[chosen], outward.reshape(-1, 2)[chosen], rank > 0)
+    cell = np.stack([column, row], axis=-1)
+
+    def crossings(axis):
+        """The border between each cell and the next: where, its slope, a rank that is 0 where there is none."""
+        here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 0 else (np.s_[:-1], np.s_[1:])
+        crosses = mask[here] != mask[there]
+        change = cover[here] - cover[there]
+        even = jnp.abs(change) < 0.01  # two cells that are covered by one half
+        share = jnp.where(even, 0.5, jnp.clip((cover[here] - 0.5) / jnp.where(even, 1, change), 0, 1))
+        place = cell[here].astype(depth.dtype) + share[..., None] * np.eye(2, dtype=depth.dtype)[axis]
+        kept = crosses & ~jnp.where(mask[here], cut[here], cut[there])
+        # A fixed shuffle: neighbours lie far apart.
+        spread = ((row * 7919 + column * 104729 + axis * 2011) % 4093).astype(np.int32)[here]
+        return place, slope[here] + slope[there], jnp.where(kept, spread + 1, 0)
+
+    flat = lambda first, second: jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in (first, second)])
+    place, slope, rank = (flat(*both) for both in zip(crossings(0), crossings(1), strict=True))
+    rank, chosen = lax.top_k(rank, min(count, rank.shape[0]))
+    outward = slope[chosen] / jnp.sqrt(jnp.sum(slope[chosen] ** 2, axis=-1, keepdims=True) + 1e-12)
+    return Contour(place[chosen], outward, rank > 0)
 
 
 class Cloud(eqx.Module):

@@ -13,7 +13,7 @@ from ipjax_kernels.rasterize import splat_colours, splat_depth
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ipjax.cameras import project
+from ipjax.cameras import project, resize_pixels
 from ipjax.config import ScoreConfig
 from ipjax.features import object_features
 from ipjax.types import Agreement, Camera, Patches, Query, Similarity, Surface, Templates
@@ -232,7 +232,7 @@ def _carried_cosine(
     rows, columns = _grid_shape(query)
     placed = camera_from_object @ patches.points
     pixel = project(query.view.camera, placed)
-    cell = (pixel + 0.5) / jnp.array([width / columns, height / rows], pixel.dtype) - 0.5
+    cell = resize_pixels(pixel, (width, height), (columns, rows))
     # Patches of the mask without a depth have no point, but their features are as good.
     inside = _patch_cover(query.view.mask, rows, columns) > 0.25
     sampled, share = _sample(query.patches.features, inside, cell, rows, columns)

@@ -4,11 +4,13 @@ Shared by tests, notebooks and benchmarks. The stand-in encoder turns that coord
 matching is as hard as the noise asked for, no weights are needed, and every image is exact.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
 from ipjax.features import describe
 from ipjax.host.viewpoints import viewpoints
@@ -45,28 +47,91 @@ def make_encoder(channels: int = 32, seed: int = 0) -> CoordinateEncoder:
 
 def see(camera_from_object: Similarity, side: int, fill: float = 0.83) -> View:
     """The ellipsoid's exact image; depth in the unit of the pose's translation; the camera frames the object."""
+    translation = np.asarray(camera_from_object.translation, np.float64)
+    reach = 0.5 * float(camera_from_object.scale) / np.linalg.norm(translation)
+    focal = fill * side / 2 / reach
+    centre = (side - 1) / 2 - focal * translation[:2] / translation[2]
+    rgb, depth, mask = picture(camera_from_object, np.array([focal, focal]), centre, side, side)
+    return View(
+        jnp.asarray(rgb, jnp.float32),
+        jnp.asarray(depth, jnp.float32),
+        jnp.asarray(mask),
+        Camera(jnp.full(2, focal, jnp.float32), jnp.asarray(centre, jnp.float32)),
+    )
+
+
+def picture(
+    camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Colours, depth and mask of the ellipsoid as any pinhole sees it, exact at every pixel's centre."""
     rotation = np.asarray(camera_from_object.rotation, np.float64)
     translation = np.asarray(camera_from_object.translation, np.float64)
     scale = float(camera_from_object.scale)
-    reach = 0.5 * scale / np.linalg.norm(translation)
-    focal = fill * side / 2 / reach
-    centre = (side - 1) / 2 - focal * translation[:2] / translation[2]
-    columns, rows = np.meshgrid(np.arange(side), np.arange(side))
-    rays = np.stack([(columns - centre[0]) / focal, (rows - centre[1]) / focal, np.ones_like(rows)], -1)
+    # Only pixels that the sphere around it can reach are worth a ray.
+    reach = 0.5 * scale / (translation[2] - 0.5 * scale) * (1 + np.abs(translation[:2]).max() / translation[2])
+    middle = translation[:2] / translation[2]
+    low = np.clip(np.floor((middle - reach) * focal + centre), 0, [width, height]).astype(int)
+    high = np.clip(np.ceil((middle + reach) * focal + centre) + 1, 0, [width, height]).astype(int)
+    columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
+    rays = np.stack([(columns - centre[0]) / focal[0], (rows - centre[1]) / focal[1], np.ones_like(rows)], -1)
     origin = -(rotation.T @ translation) / scale / AXES
     direction = (rays @ rotation) / scale / AXES
     a, b, c = (direction**2).sum(-1), (direction * origin).sum(-1), (origin**2).sum() - 1
     root = b**2 - a * c
     hit = root > 0
-    depth = np.where(hit, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
-    coordinate = (origin + depth[..., None] * direction) * AXES
-    rgb = np.where(hit[..., None], 0.5 + 0.45 * coordinate / AXES, 0)
-    return View(
-        jnp.asarray(rgb, jnp.float32),
-        jnp.asarray(depth, jnp.float32),
-        jnp.asarray(hit),
-        Camera(jnp.full(2, focal, jnp.float32), jnp.asarray(centre, jnp.float32)),
+    distance = np.where(hit, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    coordinate = origin + distance[..., None] * direction
+    rgb, depth = np.zeros((height, width, 3), np.float32), np.zeros((height, width))
+    mask = np.zeros((height, width), bool)
+    window = np.s_[low[1] : high[1], low[0] : high[0]]
+    rgb[window] = np.where(hit[..., None], 0.5 + 0.45 * coordinate, 0)
+    depth[window], mask[window] = distance, hit
+    return rgb, depth, mask
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """A whole image of the ellipsoid, and where it is."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]  # metres
+    mask: Bool[np.ndarray, "h w"]
+    matrix: Float[np.ndarray, "3 3"]
+    camera_from_object: Similarity
+
+
+def make_frame(seed: int, height: int = 480, width: int = 640, share: tuple[float, float] = (0.25, 0.5)) -> Frame:
+    """An exact image of the ellipsoid before a wall, at a random pose, size and place, by a random camera.
+
+    ``share``: of the image's height that the diameter takes, smallest and largest.
+    """
+    rng = np.random.default_rng(seed)
+    focal = rng.uniform(0.8, 1.2) * width * np.array([1, rng.uniform(0.99, 1.01)])
+    centre = np.array([(width - 1) / 2, (height - 1) / 2]) + rng.normal(0, 0.01, 2) * width
+    scale, wanted = rng.uniform(0.1, 0.3), rng.uniform(*share) * height
+    distance = focal[1] * scale / wanted
+    room = 0.7 * wanted
+    place = rng.uniform([room, room], [width - room, height - room])
+    truth = Similarity(
+        jnp.asarray(random_rotation(rng), jnp.float32),
+        jnp.asarray([*((place - centre) / focal * distance), distance], jnp.float32),
+        jnp.asarray(scale, jnp.float32),
     )
+    rgb, depth, mask = picture(truth, focal, centre, height, width)
+    depth[~mask] = distance + 1.5 * scale
+    matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    return Frame(np.round(255 * rgb).astype(np.uint8), depth.astype(np.float32), mask, matrix, truth)
+
+
+def outline(camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray) -> Float[np.ndarray, "3 3"]:
+    """The conic that the ellipsoid's silhouette is in the image: x̃ᵀ C x̃ = 0, negative inside."""
+    # In the object's frame the dual quadric is diag(a², b², c², −1); a camera projects it to the dual conic.
+    rotation = np.asarray(camera_from_object.rotation, np.float64) * float(camera_from_object.scale)
+    projection = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]) @ np.concatenate(
+        [rotation, np.asarray(camera_from_object.translation, np.float64)[:, None]], axis=1
+    )
+    conic = np.linalg.inv(projection @ np.diag([*AXES**2, -1]) @ projection.T)
+    return conic * np.sign(conic[0, 0])
 
 
 def make_surface(count: int) -> Surface:

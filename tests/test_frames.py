@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from PIL import Image
 
+from benchmarks.bias import frame_errors, summary
 from ipjax.host.frames import clean_depth, frame, frame_turned
 from ipjax.host.images import Intrinsics, as_mask, read_camera, read_depth, read_mask, read_rgb
 from ipjax.types import Camera
@@ -59,6 +60,28 @@ def test_points_of_the_crop_lie_where_the_frame_saw_them(crop, left, top, width,
     edge = 1.0
     assert (pixels[inside] >= (left - 0.5 - edge, top - 0.5 - edge)).all()
     assert (pixels[inside] <= (left + width - 0.5 + edge, top + height - 0.5 + edge)).all()
+
+
+@pytest.mark.parametrize(
+    ("crop", "size"),
+    [
+        ("square", (640, 480)),
+        ("square", (641, 479)),
+        ("square", (1280, 720)),
+        ("square", (2560, 1440)),
+        ("square", (2561, 1441)),
+        ("square", (4096, 3072)),
+        ("look_at", (641, 479)),
+        ("look_at", (2561, 1441)),
+    ],
+)
+def test_a_crop_is_off_to_no_side(size, crop):
+    """Depth and mask of exact images, large and small: signed errors within three standard errors of zero."""
+    found = [frame_errors(seed, *size, resolution=112, crop=crop, share=(0.2, 0.4)) for seed in range(12)]
+    for what, finest in (("depth", 0.002), ("mask", 0.01)):  # pixels; the mask's size in %
+        mean, error = summary([one[what] for one in found])
+        assert (np.abs(mean) <= 3 * error + finest)[np.isfinite(mean)].all(), (what, mean, error)
+    assert np.nanmax([np.abs(one["depth"]) for one in found]) < 0.05
 
 
 def test_the_square_crop_pads_centres_and_keeps_pixel_centres():

@@ -10,8 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.bias import contour_errors, pose_errors, summary
 from ipjax.config import RefineConfig
-from ipjax.features import lift
+from ipjax.features import observe
+from ipjax.host.frames import frame
+from ipjax.pipeline import _Scene as Scene
 from ipjax.refinement import (
     Cloud,
     _linearise,
@@ -24,7 +27,7 @@ from ipjax.refinement import (
     trace_contour,
     unevenness,
 )
-from ipjax.types import Camera, Pairs
+from ipjax.types import Pairs
 
 GRID = 56  # as the defaults have it
 CONFIG = RefineConfig(steps=15, points=256)
@@ -37,12 +40,29 @@ NO_PAIRS = Pairs(jnp.zeros((512, 3)), jnp.zeros((512, 3)), jnp.zeros(512))
 def scene():
     """The ellipsoid's surface, its exact depth on a 56 × 56 grid, and the true pose."""
     query, truth = problems.make_query(4)
-    points, cover = lift(query.view, GRID, GRID, 0.05)
-    camera, cell = query.view.camera, query.view.depth.shape[0] / GRID
-    camera = Camera(camera.focal / cell, (camera.centre + 0.5) / cell - 0.5)
-    valid = (cover > 0.3).reshape(GRID, GRID)
-    points = points.reshape(GRID, GRID, 3)
-    return problems.make_surface(2048), gather(points, valid, camera, valid, points[..., 2]), truth
+    return problems.make_surface(2048), reduced(query), truth
+
+
+@jax.jit
+def reduced(query) -> Cloud:
+    """The query on the grid, as the pipeline makes it."""
+    return Scene(query, GRID, 96).cloud
+
+
+def test_the_border_and_the_fit_are_off_to_no_side():
+    """Signed errors over exact images, the user's way from the whole image on: within three standard errors of zero."""
+    surface, encoder, look = problems.make_surface(2048), problems.make_encoder(), jax.jit(observe)
+    border, fit = [], []
+    for seed in range(40):
+        whole = problems.make_frame(seed)
+        view = frame(whole.rgb, whole.depth, whole.mask, whole.matrix, resolution=112)
+        cloud, truth = reduced(look(encoder, view)), whole.camera_from_object
+        border.append(contour_errors(cloud, truth)[[0, 1, 3]])
+        fit.append(pose_errors(run(surface, cloud, truth, CONFIG)[0], truth)[[0, 1, 3]])
+    for errors, spread in ((border, 0.15), (fit, 0.2)):
+        mean, error = summary(errors)
+        assert (np.abs(mean) <= 3 * error).all(), (mean, error)
+        assert np.std(errors, axis=0).max() < spread  # of the diameter in %, or three standard errors would say little
 
 
 def gather(points, valid, camera, mask, depth) -> Cloud:
@@ -217,12 +237,12 @@ trace = jax.jit(trace_contour, static_argnames="count")
 
 @pytest.mark.parametrize("count", [16, 200])
 def test_the_border_of_a_mask(count):
-    """Half a cell outside the disc's own cells, its normals outward; no more points than cells at the border."""
+    """Half a cell outside the disc's own cells, its normals outward; no more points than neighbours that differ."""
     mask = disc(7)
     found = trace(jnp.asarray(mask), jnp.ones(mask.shape, jnp.float32), 0.1, count=count)
     points, outward, valid = (np.asarray(x) for x in (found.points, found.outward, found.valid))
-    inner = mask[1:-1, 1:-1] & mask[2:, 1:-1] & mask[:-2, 1:-1] & mask[1:-1, 2:] & mask[1:-1, :-2]
-    assert valid.sum() == min(count, mask.sum() - inner.sum())
+    beside = (mask[1:] != mask[:-1]).sum() + (mask[:, 1:] != mask[:, :-1]).sum()
+    assert valid.sum() == min(count, beside)
     away = points[valid] - [11, 10]
     distance = np.linalg.norm(away, axis=-1)
     assert (np.abs(distance - 7.2) < 0.8).all()

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from ipjax.cameras import resize, resize_pixels
 from ipjax.config import Config
 from ipjax.host.camera_files import as_intrinsics
 from ipjax.host.objects import ObjectInfo
@@ -32,7 +33,7 @@ class Evidence:
     Args:
         crop: the query's crop, RGB in [0, 1] or uint8.
         template: the template whose pairs led to the answer; None = no picture was kept.
-        crop_points, template_points: the pairs, in pixels of the crop and shares of the template image's side.
+        crop_points, template_points: the pairs, in pixels of the crop, and of the template if it had a single one.
         inlier: which of the pairs agree with the pose.
     """
 
@@ -71,8 +72,8 @@ def gather_evidence(
     return Evidence(
         crop=np.asarray(query.view.rgb),
         template=info.picture(view),
-        crop_points=(crop_grid[q] + 0.5) * np.array([width / columns, height / rows]) - 0.5,
-        template_points=(template_grid[t] + 0.5) / (template_grid.max(axis=0) + 1),
+        crop_points=resize_pixels(crop_grid[q], (columns, rows), (width, height)),
+        template_points=resize_pixels(template_grid[t], tuple(template_grid.max(axis=0) + 1), (1, 1)),
         inlier=residual <= float(config.align.threshold) * float(estimate.camera_from_object.scale),
     )
 
@@ -155,10 +156,9 @@ def draw_overlay(
         else:
             rgb = cv2.undistort(rgb, K, np.asarray(intrinsics.distortion))
     if zoom != 1.0:
-        size = (round(rgb.shape[1] * zoom), round(rgb.shape[0] * zoom))
+        before, size = rgb.shape[1::-1], (round(rgb.shape[1] * zoom), round(rgb.shape[0] * zoom))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC)
-        K[:2] *= zoom
-        K[:2, 2] += (zoom - 1) / 2
+        K = resize(K, before, size)
     image = np.array(rgb)
     # Far objects first, so that near ones are drawn over them.
     for i in sorted(range(len(poses)), key=lambda i: -float(np.asarray(poses[i].translation)[2])):
@@ -358,8 +358,9 @@ def _pairs_picture(proof: Evidence, side: int, gap: int, most: int = 60) -> np.n
     else:
         picture[:, side + gap :] = _as_picture(proof.template, side)
     height, width = proof.crop.shape[:2]
-    a = (proof.crop_points + 0.5) * side / max(height, width)
-    b = proof.template_points * side + np.array([side + gap, 0])
+    longest = max(height, width)
+    a = resize_pixels(proof.crop_points, (longest, longest), (side, side))
+    b = resize_pixels(proof.template_points, (1, 1), (side, side)) + np.array([side + gap, 0])
     # All outliers behind, inliers in front; few enough that single lines can be followed. Colour by place, so that
     # lines which run together can be told apart.
     outliers, inliers = np.flatnonzero(~proof.inlier), np.flatnonzero(proof.inlier)

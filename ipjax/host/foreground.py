@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageOps
 
+from ipjax.cameras import mostly, resize_pixels
 from ipjax.host.images import as_mask, get_orientation, open_image, read_size
 from ipjax.host.storage import writing
 
@@ -33,6 +34,7 @@ class Photo:
     scale: float = 1.0  # pixels of this image per pixel of the file's upright image
     notes: tuple[str, ...] = ()
     orientation: int = 1  # as EXIF said that the file's pixels are to be turned; done here
+    full_size: tuple[int, int] | None = None  # width and height of the file's upright image; None = by the scale
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,17 +56,20 @@ def read_photo(path: str | Path, *, max_side: int = MAX_SIDE) -> Photo:
 
     Raises ValueError in one sentence that names the file: missing, no image, broken, or float.
     """
-    full = max(read_size(path))
+    full = read_size(path)
     image = open_image(path, max_side=2 * max_side)  # a JPEG at a fraction: memory and time
     orientation = get_orientation(image)
     try:
-        photo = _from_image(ImageOps.exif_transpose(image), full, max_side)
+        upright = ImageOps.exif_transpose(image)
+        if (full[0] - full[1]) * (upright.width - upright.height) < 0:  # turned by a quarter
+            full = full[::-1]
+        photo = _from_image(upright, full, max_side)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     return dataclasses.replace(photo, orientation=orientation)
 
 
-def _from_image(image: Image.Image, full: int, max_side: int) -> Photo:
+def _from_image(image: Image.Image, full: tuple[int, int], max_side: int) -> Photo:
     notes: list[str] = []
     mode = image.mode
     if mode == "F":
@@ -91,13 +96,13 @@ def _from_image(image: Image.Image, full: int, max_side: int) -> Photo:
             if transparent
             else (image.resize((wide, tall), Image.Resampling.LANCZOS))
         )
-    scale = max(image.size) / full
+    scale = max(image.size) / max(full)
     if scale < 0.999:
         notes.append(f"the photo was reduced to {image.size[0]} × {image.size[1]} pixels ({scale:.2f} of its size)")
     pixels = np.array(image)
     if pixels.shape[-1] == 4 and pixels[..., 3].min() < 255:
-        return Photo(pixels[..., :3].copy(), pixels[..., 3].copy(), scale, tuple(notes))
-    return Photo(pixels[..., :3].copy(), None, scale, tuple(notes))
+        return Photo(pixels[..., :3].copy(), pixels[..., 3].copy(), scale, tuple(notes), full_size=full)
+    return Photo(pixels[..., :3].copy(), None, scale, tuple(notes), full_size=full)
 
 
 # --- finding ----------------------------------------------------------------------------------------------------------
@@ -154,8 +159,8 @@ def _find(photo, mask, box, click, attempts) -> Foreground:
             )
         return _accept(photo, _grabcut(rgb, box=(left, top, right, bottom)), "grabcut", attempts)
     if click is not None:
-        x, y = np.asarray(click, float) * photo.scale
-        if not (0 <= x < width and 0 <= y < height):
+        x, y = resize_pixels(np.asarray(click, float), (1, 1), (photo.scale, photo.scale))
+        if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
             raise ForegroundError(f"the click {tuple(click)} lies outside the photo")
         return _accept(photo, _grabcut(rgb, click=(x, y)), "grabcut", attempts)
     found, spread = _plain_background(rgb)
@@ -184,7 +189,7 @@ def _fit_mask(mask: np.ndarray, photo: Photo) -> np.ndarray:
             f"the mask has {mask.shape[1]} × {mask.shape[0]} pixels and the photo {width} × {height}: "
             "they do not belong together"
         )
-    return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+    return mostly(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _accept(photo: Photo, mask: np.ndarray, method: str, attempts: list) -> Foreground:
@@ -255,7 +260,7 @@ def _grow(mask: np.ndarray, like: np.ndarray) -> np.ndarray:
     import cv2
 
     height, width = like.shape[:2]
-    return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
+    return mostly(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def _grabcut(rgb: np.ndarray, *, box=None, click=None) -> np.ndarray:
@@ -274,7 +279,8 @@ def _grabcut(rgb: np.ndarray, *, box=None, click=None) -> np.ndarray:
         anchor = None
     else:
         assert click is not None
-        anchor = (min(int(click[0] * factor), width - 1), min(int(click[1] * factor), height - 1))
+        x, y = np.rint(resize_pixels(np.asarray(click, float), (1, 1), (factor, factor))).astype(int).tolist()
+        anchor = (min(max(x, 0), width - 1), min(max(y, 0), height - 1))
         state[:] = cv2.GC_PR_BGD
         state[[0, -1]] = cv2.GC_BGD
         state[:, [0, -1]] = cv2.GC_BGD
@@ -343,7 +349,7 @@ def draw_attempts(photo: Photo, attempts: list[tuple[str, np.ndarray]], path: st
     height, width = small.shape[:2]
     tiles = [("photo", small)]
     for name, mask in attempts:
-        shape = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        shape = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
         tiles.append((name, np.where(shape[..., None], small, small // 4)))
     sheet = []
     for name, tile in tiles:

@@ -9,7 +9,10 @@ from typing import Any, Literal
 import cv2
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from ipjax.cameras import crop as crop_camera
+from ipjax.cameras import crop_pixels, mostly, resize, resize_pixels, subsample_pixels
 from ipjax.host.camera_files import Intrinsics, as_intrinsics, list_misfits
 from ipjax.host.images import as_mask, as_native, check_mask, forget_sentinel
 from ipjax.types import Camera, Similarity, View
@@ -219,6 +222,39 @@ def clean_depth(depth: np.ndarray, edge_tolerance: float = 0.02) -> np.ndarray:
             cv2.absdiff(around[dy : dy + height, dx : dx + width], depth, difference)
             agree += (difference <= tolerance).view(np.uint8)
     return np.where(agree >= 8, depth, np.float32(0))  # it agrees with itself
+
+
+def sample_depth(
+    depth: np.ndarray, x: np.ndarray, y: np.ndarray, edge_tolerance: float = 0.02
+) -> Float[np.ndarray, "*n"]:
+    """Depth along z where it was not measured: between pixels.
+
+    1 / z is interpolated between the four pixels around, which is exact on a plane. The nearest pixel's depth alone
+    would be that of another place, up to half a pixel away, and where an image is halved always to the same side.
+
+    Args:
+        depth: height × width, float32, 0 = unknown.
+        x, y: places in pixels, of shapes that broadcast; outside the image = the nearest border's.
+        edge_tolerance: of four pixels, those within this share of the nearest one are of one surface.
+
+    Returns:
+        The depth of the surface that is nearest to the place; 0 where less than half of what is around is known.
+    """
+    height, width = depth.shape
+    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    across, down = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    near = np.stack([depth[b, a] for b in (top, bottom) for a in (left, right)])
+    weight = np.stack([q * p for q in (1 - down, down) for p in (1 - across, across)])
+    weight[near <= 0] = 0
+    known = weight.sum(0)
+    # Where several are equally near, the one that hides the others, so that no side is preferred.
+    foremost = np.where(weight >= weight.max(0) - 1e-4, near, np.inf).min(0)
+    weight[np.abs(near - foremost) > edge_tolerance * foremost] = 0
+    inverse = np.sum(weight / np.maximum(near, 1e-9), axis=0)
+    found = known >= 0.5
+    return np.where(found, weight.sum(0) / np.where(found, inverse, 1), 0).astype(np.float32)
 
 
 def _check_rgb(rgb: Any) -> np.ndarray:
@@ -436,25 +472,21 @@ def _cut_square(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, ed
     left, top, right, bottom = bounds
     side = max(int(np.ceil((1 + pad) * max(right - left, bottom - top))), 8)
     left, top = round((left + right - side) / 2), round((top + bottom - side) / 2)
-    piece = _metres(_padded(depth, left, top, side), scale)
+    matrix = resize(crop_camera(K, (left, top)), (side, side), (resolution, resolution))
     cover = np.ascontiguousarray(_padded(mask.view(np.uint8), left, top, side))
-    # A large frame has neighbours that are not worth comparing one by one.
-    step = max(side // (2 * resolution), 1)
-    piece, coarse = np.ascontiguousarray(piece[::step, ::step]), np.ascontiguousarray(cover[::step, ::step])
-    piece = _trusted(piece, coarse.view(bool), erosion, edge_tolerance)
-    # The source pixel in which the centre of each crop pixel lies.
-    index = np.minimum(((np.arange(resolution) + 0.5) * side / resolution).astype(int) // step, piece.shape[0] - 1)
-    zoom = resolution / side
-    matrix = np.array(
-        [
-            [K[0, 0] * zoom, 0, (K[0, 2] - left + 0.5) * zoom - 0.5],
-            [0, K[1, 1] * zoom, (K[1, 2] - top + 0.5) * zoom - 0.5],
-            [0, 0, 1],
-        ]
-    )
     cut_rgb = _to_float(_resize(np.ascontiguousarray(_padded(rgb, left, top, side)), resolution))
-    cut_mask = _resize(cover.astype(np.float32), resolution) >= 0.5
-    return cut_rgb, piece[index[:, None], index[None, :]], cut_mask, matrix, np.eye(3)
+    cut_mask = mostly(_resize(cover.astype(np.float32), resolution))
+    # A large frame has neighbours that are not worth comparing one by one. What lies around the square counts, too.
+    step = max(side // (2 * resolution), 1)
+    margin = 2 * step
+    begin, length = (left - margin, top - margin), side + 2 * margin
+    sparse = lambda image: np.ascontiguousarray(_padded(image, *begin, length)[::step, ::step])
+    piece = _trusted(_metres(sparse(depth), scale), sparse(mask.view(np.uint8)).view(bool), erosion, edge_tolerance)
+    # Where the centre of each crop pixel lies: in the square, in the image, in the piece.
+    pixels = np.repeat(np.arange(resolution, dtype=np.float64)[:, None], 2, axis=1)
+    pixels = crop_pixels(resize_pixels(pixels, (resolution, resolution), (side, side)), (-left, -top))
+    x, y = subsample_pixels(pixels, step, begin).T
+    return cut_rgb, sample_depth(piece, x[None, :], y[:, None], edge_tolerance), cut_mask, matrix, np.eye(3)
 
 
 def _cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, edge_tolerance):
@@ -484,24 +516,24 @@ def _cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, e
     piece = _metres(np.ascontiguousarray(depth[y0:y1, x0:x1]), scale)
     cover = np.ascontiguousarray(mask[y0:y1, x0:x1])
     piece = _trusted(piece, cover, erosion, edge_tolerance)
-    # Depth along the new axis, of the pixel that was measured.
-    columns = (np.arange(x0, x1) - K[0, 2]) / K[0, 0]
-    rows = (np.arange(y0, y1) - K[1, 2]) / K[1, 1]
-    along = crop_from_camera[2, 0] * columns[None, :] + crop_from_camera[2, 1] * rows[:, None] + crop_from_camera[2, 2]
-    piece = piece * along.astype(np.float32)
 
     image_from_crop = K @ camera_from_crop @ np.linalg.inv(matrix)
     zoom = focal / float(np.sqrt(K[0, 0] * K[1, 1]))
     many = max(int(np.ceil(1 / zoom - 0.25)), 1)  # samples per crop pixel and axis, averaged when shrinking
-    shift = (many - 1) / 2
-    fine = np.array([[1 / many, 0, -shift / many], [0, 1 / many, -shift / many], [0, 0, 1]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     size = (resolution * many, resolution * many)
-    cut_rgb = _to_float(_resize(cv2.warpPerspective(rgb, image_from_crop @ fine, size, flags=flags), resolution))
-    local = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
-    soft = cv2.warpPerspective(cover.astype(np.float32), local @ image_from_crop @ fine, size, flags=flags)
-    cut_mask = _resize(soft, resolution) >= 0.5
-    cut_depth = cv2.warpPerspective(
-        piece, local @ image_from_crop, (resolution, resolution), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    )
+    image_from_fine = image_from_crop @ resize(np.eye(3), size, (resolution, resolution))
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    cut_rgb = _to_float(_resize(cv2.warpPerspective(rgb, image_from_fine, size, flags=flags), resolution))
+    piece_from_image = crop_camera(np.eye(3), (x0, y0))
+    soft = cv2.warpPerspective(cover.astype(np.float32), piece_from_image @ image_from_fine, size, flags=flags)
+    cut_mask = mostly(_resize(soft, resolution))
+    # Depth where each crop pixel looks, and then along the new axis. Beyond the piece nothing is known.
+    y, x = np.indices((resolution, resolution))
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ (piece_from_image @ image_from_crop).T
+    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    inside = (rays[..., 2] > 0) & (np.abs(x - (x1 - x0 - 1) / 2) <= (x1 - x0) / 2)
+    inside &= np.abs(y - (y1 - y0 - 1) / 2) <= (y1 - y0) / 2
+    seen = np.stack([(x + x0 - K[0, 2]) / K[0, 0], (y + y0 - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    cut_depth = sample_depth(piece, x, y, edge_tolerance) * (seen @ crop_from_camera[2]).astype(np.float32)
+    cut_depth = np.where(inside, cut_depth, np.float32(0))
     return cut_rgb, cut_depth, cut_mask, matrix, camera_from_crop

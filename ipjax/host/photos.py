@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ipjax.cameras import resize, resize_pixels
 from ipjax.config import OnboardConfig
 from ipjax.dinov2 import Encoder
 from ipjax.host import frames
@@ -160,10 +161,8 @@ def take_shot(
         metres = _to_metres(np.asarray(depth), foreground.mask, photo.scale, depth_scale, intrinsics)
     if intrinsics is None:
         return Shot(foreground, None, None)
-    scaled = intrinsics.matrix.copy()
-    scaled[:2] *= photo.scale
-    scaled[:2, 2] += 0.5 * photo.scale - 0.5  # integer pixel centres
-    intrinsics = dataclasses.replace(intrinsics, matrix=scaled)
+    whole = photo.full_size or (width / photo.scale, height / photo.scale)
+    intrinsics = dataclasses.replace(intrinsics, matrix=resize(intrinsics.matrix, whole, (width, height)))
     if intrinsics.distortion:
         nothing = np.zeros((height, width), np.float32)
         rgb, metres_, found, _ = frames._undistort(
@@ -184,8 +183,6 @@ def _to_metres(
     depth: np.ndarray, mask: np.ndarray, scale: float, depth_scale: float | None, intrinsics: Intrinsics
 ) -> np.ndarray:
     """The depth image in metres, as large as the photo as it was read (which may have been reduced)."""
-    import cv2
-
     depth = as_native(depth)
     if depth.ndim != 2:
         raise ValueError(f"depth has one number per pixel, not the shape {list(depth.shape)}")
@@ -193,15 +190,19 @@ def _to_metres(
     if unknown:
         log.info("%s", unknown)
     height, width = mask.shape
+    unit = frames._depth_scale(depth, depth_scale, intrinsics)
     if depth.shape != mask.shape:
         if any(abs(d * scale - p) > 1.0 for d, p in zip(depth.shape, mask.shape, strict=True)):
             raise ValueError(
                 f"the photo has {width / scale:.0f} × {height / scale:.0f} pixels, the depth image "
                 f"{depth.shape[1]} × {depth.shape[0]}: align the depth to the photo first"
             )
-        kept = depth if depth.dtype in (np.uint16, np.float32) else depth.astype(np.float32)
-        depth = cv2.resize(kept, (width, height), interpolation=cv2.INTER_NEAREST)
-    unit = frames._depth_scale(depth, depth_scale, intrinsics)
+        wide, high = (
+            resize_pixels(np.arange(after, dtype=float)[:, None], (after, after), (before, before))[:, 0]
+            for before, after in zip(depth.shape[::-1], (width, height), strict=True)
+        )
+        known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+        depth = frames.sample_depth(known, wide[None, :], high[:, None])
     frames._check_unit(depth, mask, (0, 0, width, height), unit)
     return frames._metres(depth, unit)
 

@@ -22,6 +22,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from ipjax.cameras import resize
 from ipjax.host.meshes import Mesh, sample_texture
 from ipjax.host.progress import bar
 from ipjax.types import Camera, Similarity, View
@@ -526,13 +527,13 @@ def _draw_raster(job: _Job, progress: Callable[[int, int], None] | None) -> Rend
     device_faces = jnp.asarray(faces, jnp.int32)
     for frame, (pose, intrinsics) in enumerate(zip(job.poses, job.intrinsics, strict=True)):
         moved = np.einsum("nij,nj->ni", pose[owner_vertex, :, :3], vertices) + pose[owner_vertex, :, 3]
-        # A pixel's centre x lies at factor * x + (factor − 1) / 2 among the samples.
-        centre = intrinsics[2:] * factor + (factor - 1) / 2
+        camera = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1]])
+        camera = resize(camera, (job.width, job.height), (width, height))
         drawn = rasterize(
             jnp.asarray(moved, jnp.float32),
             device_faces,
-            jnp.asarray(intrinsics[:2] * factor, jnp.float32),
-            jnp.asarray(centre, jnp.float32),
+            jnp.asarray(camera[[0, 1], [0, 1]], jnp.float32),
+            jnp.asarray(camera[:2, 2], jnp.float32),
             height,
             width,
             near=jnp.asarray(near[frame], jnp.float32),

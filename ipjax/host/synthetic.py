@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
+from ipjax.cameras import resize_pixels
 from ipjax.host.meshes import Mesh, make_mesh, normalise
 from ipjax.host.rendering import render_scene
 from ipjax.types import Camera, Similarity
@@ -597,8 +598,8 @@ def _visible_share(clouds: Sequence[np.ndarray], view: tuple[np.ndarray, np.ndar
     nearest = np.full((len(clouds), 3 * rows, 3 * columns), np.inf)
     for layer, cloud in zip(nearest, clouds, strict=True):
         points = cloud @ view[0].T + view[1]
-        x, y = (points[:, :2] / points[:, 2:] * np.asarray(camera.focal) + np.asarray(camera.centre)).T / cell
-        x, y = np.floor(x).astype(int) + columns, np.floor(y).astype(int) + rows
+        pixels = points[:, :2] / points[:, 2:] * np.asarray(camera.focal) + np.asarray(camera.centre)
+        x, y = np.rint(resize_pixels(pixels, (cell, cell), (1, 1))).astype(int).T + np.array([[columns], [rows]])
         inside = (x >= 0) & (x < 3 * columns) & (y >= 0) & (y < 3 * rows)
         np.minimum.at(layer, (y[inside], x[inside]), points[inside, 2])
     mine = np.isfinite(nearest[0])
