@@ -138,7 +138,7 @@ def measure_poses(scenes: int, directions: int, rolls: int) -> list[str]:
         errors["contour"].append(contour_errors(cloud, truth))
         for name, pose in (
             ("refine, from the truth", fit(cloud, truth)),
-            ("estimate", find(templates, query, jax.random.key(seed), config).camera_from_object),
+            ("estimate", find(None, templates, query, jax.random.key(seed), config).camera_from_object),
         ):
             errors[name].append(pose_errors(pose, truth))
             turned[name].append(rotation_error(pose, truth))

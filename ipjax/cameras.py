@@ -5,12 +5,12 @@ image calls :func:`crop`, :func:`resize` or :func:`subsample` for its camera (or
 names for pixels. Sizes and places are (x, y): width first.
 """
 
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ipjax.types import Camera
 
@@ -100,14 +100,14 @@ def _move(pixels, zoom, shift):
     return pixels * zoom.astype(pixels.dtype) + shift.astype(pixels.dtype)
 
 
-def _change(camera, zoom, shift):
+def _change(camera: Any, zoom: np.ndarray, shift: np.ndarray) -> Any:
     if isinstance(camera, Camera):
         return Camera(camera.focal * zoom.astype(camera.focal.dtype), _move(camera.centre, zoom, shift))
     return np.array([[zoom[0], 0, shift[0]], [0, zoom[1], shift[1]], [0, 0, 1]]) @ camera
 
 
-def mostly(cover: Float[Array, "h w"] | Float[np.ndarray, "h w"]) -> Bool[Array, "h w"] | Bool[np.ndarray, "h w"]:
-    """The pixels of which at least half are covered, as a mask was averaged.
+def mostly(cover: Float[Array, "h w"] | Float[np.ndarray, "h w"]) -> Any:
+    """The pixels of which at least half are covered, as booleans: the mask, where a mask was averaged.
 
     Of those that are covered by exactly half, which are many where an image was halved, every other one: all of them
     would let the mask grow by a quarter of a pixel on every side.

@@ -62,7 +62,7 @@ def read_photo(path: str | Path, *, max_side: int = MAX_SIDE) -> Photo:
     try:
         upright = ImageOps.exif_transpose(image)
         if (full[0] - full[1]) * (upright.width - upright.height) < 0:  # turned by a quarter
-            full = full[::-1]
+            full = full[1], full[0]
         photo = _from_image(upright, full, max_side)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
