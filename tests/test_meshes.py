@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from ipjax.host import farthest
+from ipjax.dinov2 import Encoder
+from ipjax.host import farthest, onboarding
 from ipjax.host.farthest import largest_distance
 from ipjax.host.meshes import (
     clean,
@@ -337,3 +338,33 @@ def test_reconstructions_are_read_with_their_colours_and_lose_their_crumbs(tmp_p
     repaired, report = clean(mesh)
     assert len(repaired.faces) == len(body.faces)
     assert any("22 of 23 components" in line for line in report) == bool(crumbs)
+
+
+class Blind(Encoder):
+    """An encoder that is never asked."""
+
+    def __init__(self):
+        self.identity = "blind"
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-7, 3e-4])
+def test_a_line_is_refused_before_it_is_rendered(noise, monkeypatch):
+    """Faces of almost no area along a line in space; anything wider is a shape, however flat."""
+    random = np.random.default_rng(2)
+    ladder = np.linspace(-1, 1, 40)[:, None] * [1.0, 2.0, -0.5] + noise * random.normal(size=(40, 3))
+    faces = np.stack([np.arange(38), np.arange(1, 39), np.arange(2, 40)], axis=-1)
+    monkeypatch.setattr(onboarding, "render", lambda *_, **__: pytest.fail("rendered"))
+    with pytest.raises(ValueError, match=r"lie on a line|no face of the mesh has an area"):
+        onboarding.onboard(make_mesh(ladder, faces), Blind())
+    flat = ball().vertices * [1, 0.5, 0]
+    axes = onboarding.box_axes(normalise(make_mesh(flat, ball().faces)).vertices)
+    np.testing.assert_allclose(np.abs(axes[np.abs(axes[:, 2]).argmax()]), [0, 0, 1], atol=1e-6)
+
+
+def test_the_box_of_a_smooth_body_is_that_of_its_axes():
+    """Tens of thousands of corners, of which some are looked at: the box is as small as the axes' own within 2 %."""
+    d = np.random.default_rng(3).normal(size=(30_000, 3))
+    body = d / np.linalg.norm(d, axis=1, keepdims=True) * [0.5, 0.4, 0.25]
+    axes = onboarding.box_axes(body)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-6)
+    assert np.prod(np.ptp(body @ axes.T, axis=0)) < 1.02 * 1 * 0.8 * 0.5

@@ -226,7 +226,8 @@ class _Reader:
                 if not comma:
                     raise ValueError
                 if head.lower().endswith(";base64"):
-                    return base64.b64decode(unquote_to_bytes(body), validate=True)
+                    text = b"".join(unquote_to_bytes(body).split())
+                    return base64.b64decode(text + b"=" * (-len(text) % 4), validate=True)
                 return unquote_to_bytes(body)
             except (ValueError, binascii.Error):
                 raise ValueError("has a data URI that is not valid") from None

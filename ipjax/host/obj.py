@@ -338,7 +338,8 @@ def assemble(
     placed = (corners[:, :, 1] >= 0).all(axis=1)
     if placed.any() and not textures:
         named = any(material.image for material in materials.values())
-        painted = any(material.colour is not None for material in materials.values()) and not named
+        # Several colours are a look of its own; a single one is what exporters write where they have none.
+        painted = len({material.colour for material in materials.values()} - {None}) > 1 and not named
         guess = None if painted else source.guess_texture()
         if guess is not None:
             textures = dict.fromkeys((int(number) for number in np.unique(owner)), guess)

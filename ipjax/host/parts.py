@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import posixpath
 import unicodedata
 from pathlib import Path
 from urllib.parse import unquote_to_bytes
@@ -181,7 +182,7 @@ class Source:
 def _look(folder: Path, name: str) -> Path | None:
     """A file in the folder or below, whatever the case and the Unicode form of its name; an absolute path of another
     machine is looked for by its last part."""
-    for text in (name, name.rsplit("/", 1)[-1]):
+    for text in (posixpath.normpath(name), name.rsplit("/", 1)[-1]):
         here, parts = folder, [part for part in text.split("/") if part not in ("", ".")]
         if ":" in text or text.startswith("/") or ".." in parts or not parts:
             continue
