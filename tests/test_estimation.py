@@ -1,12 +1,17 @@
-"""From the crop's camera to that of the whole image: everything that is told in camera axes turns along."""
+"""From the crop's camera to that of the whole image, everything that is told in camera axes turns along; and templates
+are compacted before they are compared with anything."""
+
+import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
 import problems
 from estimates import make_estimate
 
-from ipjax.host.estimation import _turn
-from ipjax.types import Similarity
+from ipjax.host.estimation import MULTIPLE, Estimator, _turn
+from ipjax.host.exporting import blank_query
+from ipjax.host.objects import ObjectInfo, compact
+from ipjax.types import Patches, Query, Similarity
 
 
 def test_pose_alternatives_and_covariance_turn_together():
@@ -26,3 +31,55 @@ def test_pose_alternatives_and_covariance_turn_together():
         spread = moved @ after[block, block] @ moved
         np.testing.assert_allclose(spread, direction @ before[block, block] @ direction, rtol=1e-4)
     assert turned.scale_std is found.scale_std and turned.ambiguity is found.ambiguity
+
+
+def spread_out(templates, cells: int):
+    """The templates in the middle of a larger grid whose other cells are background."""
+    views, count = templates.norm.shape
+    side = int(np.sqrt(count))
+    row, column = np.divmod(np.arange(count), side)
+    place = (row + 1) * cells + column + 1
+
+    def put(x):
+        wide = np.zeros((views, cells * cells, *np.shape(x)[2:]), np.asarray(x).dtype)
+        wide[:, place] = np.asarray(x)
+        return jnp.asarray(wide)
+
+    row, column = np.divmod(np.arange(cells * cells, dtype=np.float32), np.float32(cells))
+    grid = jnp.broadcast_to(jnp.stack([column, row], -1), (views, cells * cells, 2))
+    old = templates.patches
+    patches = Patches(put(old.features), put(old.points), grid, put(old.valid), old.encoder)
+    return dataclasses.replace(templates, patches=patches, norm=put(templates.norm), seen=put(templates.seen))
+
+
+def test_the_estimator_compares_compacted_templates(monkeypatch):
+    """What reaches the graph has no background to speak of, also where objects are added later or exchanged."""
+    whole = spread_out(problems.make_templates(4), 16)
+    info, query = ObjectInfo("ball", "none"), problems.make_query(3)[0]
+    small = compact(whole, multiple=MULTIPLE)
+    assert small.norm.shape[1] < whole.norm.shape[1] == 256
+    still = Similarity(jnp.eye(3), jnp.zeros(3), jnp.asarray(1.0))
+    given = []
+
+    def ready(self, name, function, seconds, *arguments):
+        given.append(arguments[1])
+        seconds[name] = 0.0
+        return lambda *_: make_estimate(still)
+
+    monkeypatch.setattr(Estimator, "_ready", ready)
+    estimator = Estimator([(whole, info)], None)
+    for _ in range(2):
+        result = estimator.run(0, query.view, still, patches=query.patches)
+    estimator.objects.append((whole, info))
+    estimator.run(1, query.view, still, patches=query.patches)
+    estimator.objects = [(dataclasses.replace(whole, mean=whole.mean + 1), info)]
+    estimator.run(0, query.view, still, patches=query.patches)
+    assert [templates.norm.shape for templates in given] == [small.norm.shape] * 4
+    assert given[0] is given[1] is result.templates and float(given[3].mean[0] - given[0].mean[0]) == 1
+    assert isinstance(result.query, Query)
+
+
+def test_an_exported_query_has_the_whole_grid():
+    whole = spread_out(problems.make_templates(4), 16)
+    for templates in (whole, compact(whole)):
+        assert blank_query(templates, 224).patches.valid.shape == (256,)

@@ -184,6 +184,16 @@ def test_what_does_not_fit_is_said(templates, change, message):
         config.update("jaxtyping_disable", False)
 
 
+def test_compacted_templates_give_the_same_answer(templates):
+    """Background is left out of the templates, and of nothing that is told."""
+    small = ipjax.compact(templates, multiple=8)
+    assert small.norm.shape[1] < templates.norm.shape[1]
+    for seed in range(3):
+        query, _ = problems.make_query(seed)
+        whole, found = (estimate(one, query, jax.random.key(seed), TINY) for one in (templates, small))
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-4, rtol=1e-3), whole, found)
+
+
 def two_objects():
     """The ellipsoid onboarded twice: more and fewer views, patches, and points of surface and appearance."""
     large = dataclasses.replace(problems.make_templates(), appearance=problems.make_appearance(20_000))

@@ -12,9 +12,12 @@ import numpy as np
 from ipjax.config import Config
 from ipjax.features import describe
 from ipjax.host.frames import frame_turned
-from ipjax.host.objects import ObjectInfo
+from ipjax.host.objects import ObjectInfo, compact
 from ipjax.pipeline import estimate
 from ipjax.types import Patches, PoseEstimate, Query, Similarity, Templates
+
+# Patches of compacted templates: every other count compiles anew, and objects differ; this makes two sizes of most.
+MULTIPLE = 64
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,9 @@ class Result:
 
 class Estimator:
     """Objects and an encoder, ready for frames; compiles once for each shape of templates.
+
+    Templates lose their background when they are first used (`objects.compact`): the answers are the same, in about
+    half the time for matching.
 
     Args:
         objects: templates and what is known of them, as `objects.load` returns them.
@@ -52,6 +58,7 @@ class Estimator:
         self.config = config
         self.options: dict[str, Any] = {"crop": "square"} | options
         self._compiled: dict[Any, Any] = {}
+        self._compacted: dict[int, Templates] = {}
 
     def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
         """The crop of one object, without looking at it yet: bad input is refused here.
@@ -82,6 +89,9 @@ class Estimator:
             patches: of the view, where it has been described already.
         """
         templates, info = self.objects[index]
+        if self._compacted.get(index) is not templates:
+            templates = self._compacted[index] = compact(templates, multiple=MULTIPLE)
+            self.objects[index] = templates, info
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)
         known = None if diameter is None else jnp.asarray(diameter, jnp.float32)

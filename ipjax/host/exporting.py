@@ -67,8 +67,12 @@ def _to_query(tree: dict[str, Any]) -> Query:
 
 
 def blank_query(templates: Templates, resolution: int) -> Query:
-    """A query of the shapes that go with the templates, of zeros: square crops of ``resolution`` pixels."""
-    patches, channels = templates.norm.shape[-1], templates.mean.shape[-1]
+    """A query of the shapes that go with the templates, of zeros: square crops of ``resolution`` pixels.
+
+    It has as many patches as the grid has cells, of which compacted templates keep only some.
+    """
+    columns, rows = (int(side) + 1 for side in np.asarray(templates.patches.grid).reshape(-1, 2).max(axis=0))
+    patches, channels = columns * rows, templates.mean.shape[-1]
     zeros = lambda *shape: jnp.zeros(shape, jnp.float32)
     square = (resolution, resolution)
     return Query(
