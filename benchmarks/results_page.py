@@ -132,7 +132,7 @@ def tables(study: Study) -> list[tuple[str, list[list[str]]]]:
         rows.append([run["method"], *cells, "–" if seconds is None else f"{seconds:.1f}"])
     found.append(("Medians of what was found, areas under the curve to 10 cm, time", rows))
     if any(run["all_frames"].get("sized") for run in runs):
-        rows = [["method", *(f"{name}, %" if "size" in name else f"AR {name}" for name in SIZED.values())]]
+        rows = [["method", *(name if "size" in name else f"AR {name}" for name in SIZED.values())]]
         for run in runs:
             sized = run["all_frames"].get("sized", {})
             cells = [
