@@ -262,6 +262,10 @@ def test_an_alignment_moves_the_mesh_and_is_named(small, tmp_path):
     found = evaluation.score(rows, small, ("mssd",), objects=[2], alignments={2: alignment}, samples=0)
     assert found.all_frames.recalls["mssd"] == 1 / 4
     assert "mesh_to_model.json" in found.table()
+    for bad, says in ((-1.0, "it mirrors"), (1.3, "it scales by 1.3")):
+        path.write_text(json.dumps({"scale": 250.0, "R": (bad * turn).tolist(), "t": [0, 0, 0]}))
+        with pytest.raises(DatasetError, match=f"mesh_to_model.json: R is no rotation: {says}"):
+            evaluation.read_alignment(path)
     path.write_text('{"scale": 1}')
     with pytest.raises(DatasetError, match="an alignment is JSON"):
         evaluation.read_alignment(path)
@@ -646,6 +650,13 @@ def written(name, text):
         (
             written("test/000000/scene_gt.json", '{"0": [], "1": []}'),
             "1 instances of object 2 in scene 0, image 0, but 0",
+        ),
+        (
+            written(
+                "test/000000/scene_gt.json",
+                '{"0": [{"obj_id": 2, "cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, -1], "cam_t_m2c": [0, 0, 700]}]}',
+            ),
+            "scene_gt.json, image 0, instance 0: cam_R_m2c: R is no rotation: it mirrors",
         ),
         (
             written("test/000000/scene_camera.json", '{"0": {"cam_K": [1]}}'),

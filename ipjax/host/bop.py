@@ -213,6 +213,10 @@ class Dataset:
             if not isinstance(item, dict) or not isinstance(item.get("obj_id"), int):
                 raise DatasetError(f"{at}: obj_id is missing or no integer")
             rotation = _numbers(item, "cam_R_m2c", 9, at).reshape(3, 3)
+            try:
+                check_rotation(rotation)
+            except ValueError as error:
+                raise DatasetError(f"{at}: cam_R_m2c: {error}") from None
             translation = _numbers(item, "cam_t_m2c", 3, at) * MM
             visible, box = shares[index] if shares is not None and index < len(shares) else (-1.0, None)
             found.append(Truth(item["obj_id"], index, rotation, translation, visible, box))

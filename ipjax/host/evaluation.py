@@ -96,8 +96,12 @@ def read_alignment(path: str | Path) -> Alignment:
         R, t = R.reshape(3, 3), t.reshape(3)
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise DatasetError(f"{path}: an alignment is JSON with scale, R (3 × 3) and t (3) ({error})") from None
-    if not (scale > 0 and np.isfinite(t).all() and np.allclose(R @ R.T, np.eye(3), atol=1e-3)):
-        raise DatasetError(f"{path}: the scale must be positive, R a rotation and t finite")
+    if not (0 < scale < math.inf and np.isfinite(R).all() and np.isfinite(t).all()):
+        raise DatasetError(f"{path}: the scale must be positive, R and t finite")
+    try:
+        check_rotation(R)
+    except ValueError as error:
+        raise DatasetError(f"{path}: {error}") from None
     return Alignment(scale * MM, R, t * MM, path.name)
 
 
