@@ -167,7 +167,9 @@ def _polar_of_triangles(matrix, share, source, target):
     )
     straight, over = (xx + yy, yx - xy), (xx - yy, yx + xy)
     straight, over = _part((straight, over))
-    straight_trace, over_trace = (jnp.sqrt(c * c + s * s) for c, s in (straight, over))
+    # Computed once: of collinear points the two are equal up to rounding, and if each reader of the comparison had its
+    # own rounding, cosine and sine could come from different ones.
+    straight_trace, over_trace = _part(tuple(jnp.sqrt(c * c + s * s) for c, s in (straight, over)))
     turned = over_trace > straight_trace
     trace = jnp.where(turned, over_trace, straight_trace)
     known = trace > 0
@@ -262,7 +264,7 @@ def _decompose(matrix: Float[Array, "3 3 m"]) -> tuple[Float[Array, "3 3 m"], Fl
 
     start = tuple(tuple(matrix[row, column] for row in range(3)) for column in range(3))
     columns, basis = _part(jax.lax.fori_loop(0, iterations, rotate, (start, identity)))
-    norms, basis = [_dot(column, column) for column in columns], list(basis)
+    norms, basis = list(_part(tuple(_dot(column, column) for column in columns))), list(basis)
     for i, j in ((0, 1), (1, 2), (0, 1)):
         swap = norms[j] > norms[i]
         norms[i], norms[j] = jnp.where(swap, norms[j], norms[i]), jnp.where(swap, norms[i], norms[j])
