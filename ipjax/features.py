@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from ipjax.cameras import point_map
 from ipjax.config import DescribeConfig
 from ipjax.types import UNNAMED, Patches, Query, Templates, View
+from ipjax.validity import finite_patches, finite_view
 
 
 def describe(
@@ -24,11 +25,13 @@ def describe(
       view: one image, its depth (0 = unknown), mask and camera.
 
     Returns:
-      ``p = gh·gw`` patches in row-major order; points in the view's camera frame, in the unit of its depth.
+      ``p = gh·gw`` patches in row-major order; points in the view's camera frame, in the unit of its depth. What rests
+      on numbers that are not finite is not valid (``ipjax.validity``).
 
     Raises:
       ValueError: the image is not a whole number of patches on either side.
     """
+    view, there = finite_view(view)
     features = encoder(view.rgb)
     rows, columns, channels = features.shape
     height, width = view.depth.shape
@@ -36,13 +39,14 @@ def describe(
         raise ValueError(f"the encoder made {rows}×{columns} patches of an image of {height}×{width} pixels")
     points, cover = lift(view, rows, columns, config.spread)
     grid = jnp.stack(jnp.meshgrid(jnp.arange(columns), jnp.arange(rows)), axis=-1).astype(jnp.float32)
-    return Patches(
+    patches = Patches(
         features=features.reshape(-1, channels),
         points=points,
         grid=grid.reshape(-1, 2),
-        valid=cover >= config.cover,
+        valid=(cover >= config.cover) & there,
         encoder=identity_of(encoder),
     )
+    return finite_patches(patches)
 
 
 def identity_of(encoder: object) -> str | None:

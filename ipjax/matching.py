@@ -99,7 +99,8 @@ def resemblance(templates: Patches, query: Patches) -> Float[Array, "v"]:
 
     def pool(features, cell, valid):
         inside = (cells == cell[:, 1] * CELLS + cell[:, 0]) & valid
-        total = jnp.dot(inside.astype(jnp.float32), features.astype(jnp.float32), precision="highest")
+        features = jnp.where(valid[:, None], features, 0).astype(jnp.float32)  # what is not valid may not be a number
+        total = jnp.dot(inside.astype(jnp.float32), features, precision="highest")
         cell_norm = jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True))
         total = total / jnp.maximum(cell_norm, 1e-9)
         return total / jnp.maximum(jnp.sqrt(jnp.sum(total * total)), 1e-9)

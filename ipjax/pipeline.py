@@ -19,6 +19,7 @@ from ipjax.matching import match, select
 from ipjax.refinement import Cloud, information, refine, settle, trace_contour
 from ipjax.scoring import score, seen_share
 from ipjax.types import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
+from ipjax.validity import finite_estimate, finite_query, finite_templates
 
 
 def estimate(
@@ -44,7 +45,9 @@ def estimate(
       diameter: the object's true diameter in metres; None = not known, the size is estimated, too.
 
     Returns:
-      ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera.
+      ``camera_from_object`` maps the normalised object frame (diameter 1) to metres in the crop's camera. All numbers
+      are finite: what is not finite among the inputs is absent, and where it cannot be (a camera, the features' mean, a
+      threshold, the diameter) ``success`` and ``present`` are False and the confidence is 0.
 
     Raises:
       ValueError: the crop is not square, or the templates, the query and the encoder are not of one encoder (by the
@@ -52,6 +55,11 @@ def estimate(
     """
     _check_shapes(templates, query)
     _check_encoders(encoder, templates, query)
+    (templates, known), (query, there) = finite_templates(templates), finite_query(query)
+    meant = known & there & _are_numbers(config)
+    if diameter is not None:
+        sized = jnp.isfinite(diameter) & (diameter > 0)
+        meant, diameter = meant & sized, jnp.where(sized, diameter, 1)
     with jax.named_scope("match"):
         matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
@@ -60,6 +68,7 @@ def estimate(
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
         poses, agreed, _, determined = align(pairs, size, key, config.align, diameter)
+        determined = determined & meant
     scale_known = diameter is not None
     scene = _Scene(query, config.score.resolution, config.refine.silhouette)
     unknown = jnp.zeros_like(agreed)
@@ -84,7 +93,7 @@ def estimate(
     count = jnp.sum(used)
     with jax.named_scope("confidence"):
         sure = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
-    return PoseEstimate(
+    found = PoseEstimate(
         camera_from_object=best.poses,
         **sure,
         hypotheses=Hypotheses(found.poses, jnp.clip(found.score, 0, 1)),
@@ -94,6 +103,12 @@ def estimate(
         rmse=jnp.sqrt(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
         success=best.determined,
     )
+    return finite_estimate(found)
+
+
+def _are_numbers(config: Config) -> Bool[Array, ""]:
+    """Whether no threshold is NaN; some may be infinite."""
+    return ~jnp.any(jnp.isnan(jnp.stack([jnp.asarray(x, jnp.float32) for x in jax.tree.leaves(config)])))
 
 
 class _Candidates(eqx.Module):

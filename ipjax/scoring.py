@@ -237,7 +237,8 @@ def _carried_cosine(
     inside = _patch_cover(query.view.mask, rows, columns) > 0.25
     sampled, share = _sample(query.patches.features, inside, cell, rows, columns)
     norm = jnp.sqrt(jnp.sum(sampled * sampled, axis=-1) + 1e-12)
-    cosine = jnp.sum(sampled * patches.features.astype(sampled.dtype), axis=-1) / norm
+    features = jnp.where(patches.valid[:, None], patches.features, 0)  # what is not valid may not be a number
+    cosine = jnp.sum(sampled * features.astype(sampled.dtype), axis=-1) / norm
     column = jnp.clip(jnp.round(pixel[:, 0]).astype(jnp.int32), 0, width - 1)
     row = jnp.clip(jnp.round(pixel[:, 1]).astype(jnp.int32), 0, height - 1)
     measured = query.view.depth[row, column]

@@ -22,6 +22,7 @@ LAYERS = {
     "ipjax.dinov2": 2,
     "ipjax.metrics": 2,
     "ipjax.triposr": 2,
+    "ipjax.validity": 2,
     "ipjax.features": 3,
     "ipjax.matching": 3,
     "ipjax.alignment": 3,

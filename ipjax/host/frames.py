@@ -350,11 +350,12 @@ def _check_unit(depth: np.ndarray, mask: np.ndarray, bounds: tuple[int, int, int
 
 def _metres(depth: np.ndarray, scale: float) -> np.ndarray:
     """float32 metres, 0 = unknown."""
-    metres = depth.astype(np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond float32 is as infinite
+        metres = depth.astype(np.float32)
+        if scale != 1.0:
+            metres *= np.float32(scale)
     if depth.dtype.kind == "f":
         metres[~np.isfinite(metres)] = 0
-    if scale != 1.0:
-        metres *= np.float32(scale)
     return np.maximum(metres, 0)
 
 

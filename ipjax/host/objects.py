@@ -421,7 +421,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
                 features=device["features"],
                 points=device["points"],
                 grid=device["grid"],
-                valid=device["valid"],
+                valid=jnp.asarray(tensors["valid"] & _is_finite(tensors)),
                 encoder=None if info.encoder in ("", UNNAMED) else info.encoder,
             ),
             mean=device["mean"],
@@ -443,6 +443,14 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
         ),
         info,
     )
+
+
+def _is_finite(tensors: dict[str, np.ndarray]) -> np.ndarray:
+    """Which patches have no number that is not finite; the others are not valid."""
+    known = np.isfinite(tensors["norm"])
+    for name in ("features", "points", "grid"):
+        known = known & np.isfinite(tensors[name]).all(axis=-1)
+    return known
 
 
 def _appearance(tensors: dict[str, np.ndarray]) -> Appearance | None:
@@ -568,8 +576,8 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise ValueError(f"{path}: not an object file, or a damaged one ({str(error).splitlines()[0]})") from None
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
-    for name in ("rotation", "translation", "focal", "centre", "extents", "surface.points"):
-        if not np.isfinite(tensors[name]).all():
+    for name in ("rotation", "translation", "focal", "centre", "extents", "axes", "mean", "basis", "surface.points"):
+        if name in tensors and not np.isfinite(tensors[name]).all():
             raise ValueError(f"{path}: damaged: {name} has values that are not finite")
     return header, tensors
 
