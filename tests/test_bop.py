@@ -226,30 +226,6 @@ def test_detections_and_the_best_of_them(tmp_path):
         bop.read_detections(path)
 
 
-def test_a_folder_of_ones_own_captures(tmp_path):
-    for kind in ("rgb", "depth", "mask"):
-        (tmp_path / kind).mkdir()
-    Image.fromarray(np.zeros((6, 8, 3), np.uint8)).save(tmp_path / "rgb" / "desk.png")
-    Image.fromarray(np.full((6, 8), 900, np.uint16)).save(tmp_path / "depth" / "desk.png")
-    for label in ("7", "12"):
-        Image.fromarray(np.eye(6, 8, dtype=np.uint8) * 255).save(tmp_path / "mask" / f"desk_{label}.png")
-    (tmp_path / "camera.json").write_text(json.dumps({"fx": 10, "fy": 10, "cx": 4, "cy": 3}))
-    with pytest.raises(DatasetError, match="integer depth has no unit"):
-        bop.Captures(tmp_path).frame("desk")
-    ((frame, targets),) = list(bop.Captures(tmp_path, depth_scale=0.001))
-    np.testing.assert_allclose(frame.depth, 0.9)
-    assert frame.name == "desk"
-    assert sorted(t.obj_id for t in targets) == [7, 12]
-    pinhole = {"fx": 10, "fy": 10, "cx": 4, "cy": 3, "depth_scale": 1.0}
-    for more, words in (({"k1": 0.1}, "undistort"), ({"w": 16, "h": 12}, "images of 16 × 12, desk has 8 × 6")):
-        (tmp_path / "camera.json").write_text(json.dumps(pinhole | more))
-        with pytest.raises(DatasetError, match=words):
-            bop.Captures(tmp_path).frame("desk")
-    (tmp_path / "camera.json").unlink()
-    with pytest.raises(DatasetError, match=r"camera\.json"):
-        bop.Captures(tmp_path)
-
-
 def test_the_mini_set_reads(shared):
     dataset = bop.Dataset(shared / "data" / "ycbv")
     assert len(dataset.targets) == 42

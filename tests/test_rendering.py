@@ -12,7 +12,7 @@ import trimesh
 from ipjax.host import rendering
 from ipjax.host.meshes import make_mesh, normalise
 from ipjax.host.rendering import RenderError, available_backends, render, render_scene
-from ipjax.host.viewpoints import template_camera, viewpoints
+from ipjax.host.viewpoints import viewpoints
 from ipjax.types import Camera, Similarity
 
 
@@ -78,7 +78,7 @@ def away_from_steps(depth, by=0.01):
 
 
 def test_templates_agree_with_ray_casting(backend):
-    mesh, poses, lens = knot(), viewpoints(5, 1), template_camera(72)
+    mesh, poses, lens = knot(), viewpoints(5, 1), camera(200, 200, 35.5, 35.5)
     calls = []
     images = render(
         mesh, poses, lens, 72, 72, backend=backend, progress=lambda done, total: calls.append((done, total))

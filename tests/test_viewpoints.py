@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ipjax.host.viewpoints import template_camera, viewpoints
+from ipjax.config import OnboardConfig
+from ipjax.host.viewpoints import viewpoints
 
 
 def test_poses_are_rotations_that_look_at_the_origin():
@@ -44,11 +45,9 @@ def test_upright_views_show_z_upwards():
     assert (rotation[:, 1, 2] < 0).all()  # the image's y is down
 
 
-def test_camera_holds_the_sphere():
-    camera = template_camera(224, 0.9, radius=0.6, distance=2.0)
-    edge = 0.6 * np.array([np.sqrt(1 - 0.3**2), 0.0, -0.3])  # where the ray from the camera touches
-    pixel = camera.focal[0] * edge[0] / (2.0 + edge[2]) + camera.centre[0]
-    np.testing.assert_allclose(pixel, 111.5 + 0.9 * 112, rtol=1e-5)
+def test_templates_are_seen_from_where_the_configuration_says():
+    distance = OnboardConfig().distance
+    np.testing.assert_allclose(viewpoints(3, 2).translation, np.broadcast_to([0, 0, distance], (6, 3)))
 
 
 def test_bad_arguments_are_told():
@@ -56,9 +55,6 @@ def test_bad_arguments_are_told():
         lambda: viewpoints(0, 10),
         lambda: viewpoints(4, 0),
         lambda: viewpoints(4, 1, distance=0.4),
-        lambda: template_camera(224, 1.5),
-        lambda: template_camera(224, 0.0),
-        lambda: template_camera(224, radius=0.5, distance=0.5),
     ):
         with pytest.raises(ValueError, match=r"\w+ \w+"):
             call()

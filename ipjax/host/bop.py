@@ -7,7 +7,7 @@ Everything is read when asked for. What cannot be read raises `DatasetError`: on
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ipjax.host.camera_files import read_camera
 from ipjax.host.images import BYTES_PER_PIXEL, as_mask, read_depth, read_mask, read_rgb, read_size
 from ipjax.host.meshes import Mesh, load_mesh, move
 from ipjax.host.storage import check_budget, read_json, write_text
@@ -433,79 +432,6 @@ class Dataset:
             ]
         except (TypeError, ValueError, AttributeError):
             raise DatasetError(f"{where}: visib_fract must be a number") from None
-
-
-class Captures:
-    """A folder of one's own captures: ``rgb/``, ``depth/``, ``mask/`` and ``camera.json``.
-
-    Files of one image share a name: ``rgb/kitchen.jpg``, ``depth/kitchen.png``, ``mask/kitchen.png``, or one mask per
-    object: ``mask/kitchen_OBJECT.png`` (a number is the object's id, other names are counted from 1).
-    ``camera.json`` is anything `images.read_camera` takes; its ``depth_scale`` multiplies depth to millimetres, as in
-    BOP. Without one, float depth is in metres and integer depth needs ``depth_scale`` (metres per unit) here.
-    """
-
-    def __init__(self, root: str | Path, *, depth_scale: float | None = None):
-        self.root = Path(root)
-        for name in ("rgb", "depth"):
-            if not (self.root / name).is_dir():
-                raise DatasetError(f"{self.root / name}: no such folder; captures need rgb/, depth/ and camera.json")
-        self.intrinsics = _checked(read_camera, self.root / "camera.json")
-        if self.intrinsics.distortion:
-            raise DatasetError(f"{self.root / 'camera.json'}: captures are of a pinhole; undistort the images first")
-        self.depth_scale = depth_scale if depth_scale is not None else self.intrinsics.depth_scale
-
-    def names(self) -> list[str]:
-        """Names of the images, sorted."""
-        return sorted(p.stem for p in (self.root / "rgb").iterdir() if p.suffix.lower() in IMAGES)
-
-    def frame(self, name: str) -> Frame:
-        """One image with its depth in metres."""
-        rgb = _checked(read_rgb, self._file("rgb", name))
-        size = (rgb.shape[1], rgb.shape[0])
-        if self.intrinsics.size not in (None, size):
-            meant = " × ".join(map(str, self.intrinsics.size or ()))
-            raise DatasetError(f"{self.root}: camera.json is for images of {meant}, {name} has {size[0]} × {size[1]}")
-        path = self._file("depth", name)
-        depth = _checked(read_depth, path)
-        if depth.shape != rgb.shape[:2]:
-            sizes = f"{depth.shape[1]} × {depth.shape[0]}, the colour image {rgb.shape[1]} × {rgb.shape[0]}"
-            raise DatasetError(f"{path}: the depth image has {sizes} pixels; align it to the colour image first")
-        scale = self.depth_scale
-        if scale is None:
-            if depth.dtype.kind != "f":
-                raise DatasetError(f"{path}: integer depth has no unit; put depth_scale (mm per unit) into camera.json")
-            scale = 1.0
-        metres = depth.astype(np.float64) * scale
-        metres = np.where(np.isfinite(metres) & (metres > 0), metres, 0).astype(np.float32)
-        return Frame(rgb, metres, self.intrinsics.matrix, 0, self.names().index(name), name)
-
-    def targets(self, name: str) -> list[Target]:
-        """The masks given for an image; empty where there is none."""
-        folder = self.root / "mask"
-        if not folder.is_dir():
-            return []
-        found = []
-        for path in sorted(folder.iterdir()):
-            if path.suffix.lower() not in (*IMAGES, ".npy"):
-                continue
-            if path.stem == name:
-                found.append(Target(1, _checked(read_mask, path)))
-            elif path.stem.startswith(name + "_"):
-                label = path.stem[len(name) + 1 :]
-                number = int(label) if label.isdigit() else len(found) + 1
-                found.append(Target(number, _checked(read_mask, path)))
-        return found
-
-    def __iter__(self) -> Iterator[tuple[Frame, list[Target]]]:
-        for name in self.names():
-            yield self.frame(name), self.targets(name)
-
-    def _file(self, kind: str, name: str) -> Path:
-        for extension in (*IMAGES, ".npy"):
-            path = self.root / kind / (name + extension)
-            if path.is_file():
-                return path
-        raise DatasetError(f"{self.root / kind / name}: no such file (.png, .jpg, .tif or .npy)")
 
 
 # COCO run-length masks (https://github.com/cocodataset/cocoapi/blob/master/common/maskApi.c describes the text form)

@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 
-from ipjax.types import Camera, Similarity
+from ipjax.config import OnboardConfig
+from ipjax.types import Similarity
 
-DISTANCE = 2.5  # model units (diameters) from the camera to the object's centre
+DISTANCE = OnboardConfig().distance  # model units (diameters) from the camera to the object's centre
 
 
 def directions_on_sphere(count: int) -> np.ndarray:
@@ -49,22 +50,3 @@ def viewpoints(directions: int = 40, rolls: int = 10, *, distance: float = DISTA
         translation=jnp.asarray(translation, jnp.float32),
         scale=jnp.ones(len(rotation), jnp.float32),
     )
-
-
-def template_camera(
-    resolution: int = 224, fill: float = 0.95, *, radius: float = 0.5, distance: float = DISTANCE
-) -> Camera:
-    """The camera of a square template: a sphere of `radius` model units at `distance` covers `fill` of the side.
-
-    An object of unit diameter whose bounding box is centred at the origin usually reaches 0.5 from it; a pyramid
-    reaches up to 0.87. Pass ``radius=max(0.5, meshes.radius(mesh))`` and no view is cut. Pixels, integer centres.
-    Raises ValueError for a fill outside (0, 1] or a camera inside the sphere.
-    """
-    if not 0 < fill <= 1:
-        raise ValueError(f"fill must be in (0, 1], got {fill}")
-    if not distance > radius > 0:
-        raise ValueError(f"the camera must be outside the object: distance {distance}, radius {radius} model units")
-    tangent = radius / np.sqrt(distance**2 - radius**2)
-    focal = fill * resolution / 2 / tangent
-    centre = (resolution - 1) / 2
-    return Camera(focal=jnp.full(2, focal, jnp.float32), centre=jnp.full(2, centre, jnp.float32))
