@@ -22,6 +22,7 @@ from ipjax.config import Config
 from ipjax.features import observe
 from ipjax.host.frames import frame_turned
 from ipjax.host.reports import Plain, compose, invert
+from ipjax.host.storage import write_text
 from ipjax.pipeline import _Scene as Scene
 from ipjax.refinement import refine
 
@@ -212,7 +213,7 @@ def main() -> None:
     )
     print(page)
     if options.page:
-        options.page.write_text(page, encoding="utf-8")
+        write_text(options.page, page)
         print(f"{options.page}: written", file=sys.stderr)
 
 

@@ -103,6 +103,7 @@ MAY = {
     ("rendering", "np.savez"): "the child's job, in a folder of its own",
     ("rendering", "write_text"): "the child's job, in a folder of its own",
     ("rendering", "open"): "what the child says, in a folder of its own",
+    ("gltf", "save"): "a picture, into memory",
     ("weights", "open"): "a download that goes on where it stopped, and a wheel unpacked in a folder of its own",
     ("evaluation", "open"): "a journal, a line at a time",
     ("photo_pairs", "open"): "a journal, a line at a time",
