@@ -117,7 +117,7 @@ def see(camera, mask=None):
 
 def test_the_tables_name_every_file(cases):
     cameras = {path.name for path in (cases / "camera").iterdir()}
-    assert cameras == READ.keys() | REFUSED.keys() | TOLD.keys() | SILENT
+    assert cameras == READ.keys() | REFUSED.keys() | TOLD.keys() | set(SILENT)
     assert {f"{path.parent.name}/{path.name}" for path in cases.glob("mask_*/*")} == MASKS.keys()
 
 
