@@ -36,7 +36,7 @@ def pixel_grid(height: int, width: int) -> Float[Array, "h w 2"]:
 def point_map(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
     """A depth image as one 3-D point per pixel, in the camera frame; depth 0 gives the origin."""
     height, width = depth.shape
-    pixels = pixel_grid(height, width).reshape(-1, 2)
+    pixels = pixel_grid(height, width).reshape(-1, 2).astype(depth.dtype)
     return unproject(camera, pixels, depth.reshape(-1)).reshape(height, width, 3)
 
 

@@ -4,10 +4,11 @@ The few numbers that turn evidence into probability were fitted on scenes made i
 """
 
 import jax.numpy as jnp
-from ipjax_kernels.positive import invert_positive, principal_axis
+from ipjax_kernels.positive import invert_positive, principal_axis, root
 from jaxtyping import Array, Bool, Float
 
 from ipjax.config import ConfidenceConfig
+from ipjax.metrics import turn_angle
 from ipjax.types import Agreement, Pairs, Similarity
 
 
@@ -37,7 +38,7 @@ def find_rival(poses: Similarity, score: Float[Array, "h"]) -> Float[Array, ""]:
       poses: best first.
     """
     angle, _ = _turn_from_first(poses)
-    moved = jnp.linalg.norm(poses.translation - poses.translation[0], axis=-1)
+    moved = root(jnp.sum((poses.translation - poses.translation[0]) ** 2, axis=-1))
     other = (angle > _APART[0]) | (moved > _APART[1] * poses.scale[0])
     return jnp.clip(jnp.max(jnp.where(other, score, 0)) / jnp.maximum(score[0], 1e-9), 0, 1)
 
@@ -49,7 +50,7 @@ def pair_information(pose: Similarity, pairs: Pairs, used: Bool[Array, "k"]) -> 
     """
     arm = jnp.sum(pose.rotation[None] * pairs.object[:, None, :], axis=-1)
     offset = (pose @ pairs.object - pairs.camera) / pose.scale
-    share = jnp.where(used, 1.0, 0.0)
+    share = used.astype(offset.dtype)
     variance = jnp.sum(share * jnp.sum(offset**2, axis=-1)) / jnp.maximum(3 * jnp.sum(share), 1)
     x, y, z = arm.T
     zero, one = jnp.zeros_like(x), jnp.ones_like(x)
@@ -89,7 +90,7 @@ def covariance(
     size = 6 if scale_known else 7
     inverse = invert_positive(information[:size, :size])
     unit = jnp.concatenate([jnp.ones(3, matrix.dtype), jnp.full(3, scale, matrix.dtype)])
-    spread = jnp.zeros((), matrix.dtype) if scale_known else scale * jnp.sqrt(jnp.maximum(inverse[6, 6], 0))
+    spread = jnp.zeros((), matrix.dtype) if scale_known else scale * root(inverse[6, 6])
     return inverse[:6, :6] * unit[:, None] * unit[None, :], spread
 
 
@@ -117,11 +118,11 @@ def loosest_turn(
     rotation = poses.rotation[0]
     own = jnp.sum(rotation[:, :, None] * jnp.sum(turned[:, :, None] * rotation[None], axis=1)[:, None, :], axis=0)
     axis, variance = principal_axis(moment + own)
-    return axis * jnp.sqrt(jnp.maximum(variance, 0))
+    return axis * root(variance)
 
 
 def _turn_from_first(poses: Similarity) -> tuple[Float[Array, "h"], Float[Array, "h 3 3"]]:
     """The angle (rad) between the first pose and each, and the turn itself in the object's frame."""
     twist = jnp.sum(poses.rotation[0][None, :, :, None] * poses.rotation[:, :, None, :], axis=1)
     trace = jnp.trace(twist, axis1=-2, axis2=-1)
-    return jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1)), twist
+    return turn_angle(trace), twist

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+from ipjax_kernels.positive import root
 from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import point_map
@@ -116,7 +117,7 @@ def check_cut(channels: int, count: int) -> None:
 def cut(features: Float[Array, "*b c"], basis: Float[Array, "f c"]) -> tuple[Float[Array, "*b f"], Float[Array, "*b"]]:
     """Unit vectors of the components of features along the rows of a basis, and their norms."""
     short = jnp.matmul(features.astype(basis.dtype), basis.T, precision="highest")
-    norm = jnp.sqrt(jnp.sum(short * short, axis=-1))
+    norm = root(jnp.sum(short * short, axis=-1))
     return short / jnp.maximum(norm, 1e-9)[..., None], norm
 
 
@@ -131,7 +132,7 @@ def centre_on(
 ) -> tuple[Float[Array, "*b c"], Float[Array, "*b"]]:
     """Unit vectors of what is left of features without ``mean``, and its norms; nothing left gives zeros."""
     rest = features - mean
-    norm = jnp.sqrt(jnp.sum(rest * rest, axis=-1))
+    norm = root(jnp.sum(rest * rest, axis=-1))
     return rest / jnp.maximum(norm, 1e-9)[..., None], norm
 
 
@@ -154,9 +155,9 @@ def lift(
     usable = patches(view.mask) & (depth > 0)
     median = _masked_median(depth, usable)
     usable = usable & (jnp.abs(depth - median[:, None]) <= spread * median[:, None])
-    count = jnp.sum(usable, axis=1)
+    count = jnp.sum(usable, axis=1, dtype=depth.dtype)
     total = jnp.sum(jnp.where(usable[..., None], points, 0), axis=1)
-    return total / jnp.maximum(count, 1)[:, None].astype(total.dtype), count / depth.shape[1]
+    return total / jnp.maximum(count, 1)[:, None], count / depth.shape[1]
 
 
 def _masked_median(values: Float[Array, "p n"], mask: Bool[Array, "p n"]) -> Float[Array, "p"]:

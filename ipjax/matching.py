@@ -2,7 +2,7 @@
 
 import jax
 import jax.numpy as jnp
-from ipjax_kernels.neighbours import cycle_distance, nearest
+from ipjax_kernels.neighbours import NO_MATCH, cycle_distance, nearest
 from jax import lax
 from jaxtyping import Array, Float
 
@@ -24,7 +24,8 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
       templates: patches ``v q`` of the object.
 
     Returns:
-      ``config.views`` templates with ``config.pairs`` pairs each, ordered by distance, then cosine, then patch.
+      ``config.views`` templates with ``config.pairs`` pairs each, ordered by distance, then cosine, then patch. Of
+      all this only the cosines of these pairs have a derivative.
 
     Raises:
       ValueError: the features of the two sides differ in length, or the shortlist is empty.
@@ -58,7 +59,8 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         cost = jnp.sum(jnp.minimum(near, worst), axis=1)
         cost = jnp.where(absent, jnp.max(cost) + 1, cost)
         ranking = -cost
-        view = lax.sort((cost, -jnp.sum(cosine, axis=1), jnp.arange(cost.shape[0])), num_keys=2)[2][: config.views]
+        index = jnp.arange(cost.shape[0], dtype=jnp.int32)
+        view = lax.sort((cost, -jnp.sum(cosine, axis=1), index), num_keys=2)[2][: config.views]
     else:
         kept = (distance <= config.cycle) & query.valid
         ranking = jnp.sum(jnp.where(kept, found.query_similarity, 0), axis=1) / jnp.maximum(
@@ -69,6 +71,8 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]
     template = jnp.take_along_axis(found.query_to_template[view], order, axis=1)
+    partner = patches.features[view[:, None], template]
+    cosine = _known_cosine(cosine[:, :pairs], query.features[order], partner)
     if chosen is not None:
         ranking = jnp.full(every, jnp.min(ranking) - 1).at[chosen].set(ranking)
         view = chosen[view]
@@ -78,8 +82,23 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         query=order,
         template=template,
         distance=near[:, :pairs],
-        similarity=cosine[:, :pairs],
+        similarity=cosine,
     )
+
+
+@jax.custom_jvp
+def _known_cosine(cosine, features, partner):
+    """Cosines that are known already: the kernel has no derivative, this one is that of the matched features."""
+    del features, partner
+    return cosine
+
+
+@_known_cosine.defjvp
+def _differentiate_cosine(primals, tangents):
+    cosine, features, partner = primals
+    change = jnp.sum(tangents[1] * partner.astype(features.dtype), axis=-1)
+    change = change + jnp.sum(features * tangents[2].astype(features.dtype), axis=-1)
+    return cosine, jnp.where(cosine > NO_MATCH, change, 0).astype(cosine.dtype)
 
 
 CELLS = 2  # on a side: of the grid that patches are pooled in to be compared at a glance
@@ -112,7 +131,7 @@ def resemblance(templates: Patches, query: Patches) -> Float[Array, "v"]:
 
 def _order(distance: Float[Array, "p"], similarity: Float[Array, "p"]):
     """Patches by distance, then cosine (high first), then index: a total order, the same everywhere."""
-    index = jnp.arange(distance.shape[0])
+    index = jnp.arange(distance.shape[0], dtype=jnp.int32)
     near, negative, index = lax.sort((distance, -similarity, index), num_keys=2, is_stable=True)
     return index, near, -negative
 

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ipjax_kernels.positive import root
 from jaxtyping import Array, Bool, Float, Int, Num
 
 from ipjax.types import Camera, Similarity
@@ -358,6 +359,11 @@ def rotation_error(truth: Float[Array, "3 3"], estimate: Float[Array, "3 3"]) ->
     return jnp.arctan2(_length(axis), jnp.trace(turn) - 1)
 
 
+def turn_angle(trace: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """The angle of rotations with these traces, radians in [0, π]; its derivative is finite at both ends, too."""
+    return 2 * jnp.arctan2(root((3 - trace) / 4), root((1 + trace) / 4))
+
+
 def translation_error(truth: Float[Array, "3"], estimate: Float[Array, "3"]) -> Float[Array, ""]:
     """Distance between two translations, in their unit."""
     return _length(truth - estimate)
@@ -403,9 +409,7 @@ def _away_from_zero(depth: Array) -> Array:
 
 def _length(vectors: Array) -> Array:
     """Euclidean length along the last axis, with a finite gradient at 0."""
-    squares = jnp.sum(vectors**2, axis=-1)
-    positive = squares > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squares, 1.0)), 0.0)
+    return root(jnp.sum(vectors**2, axis=-1))
 
 
 def _directions(count: int) -> np.ndarray:

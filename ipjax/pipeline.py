@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ipjax_kernels.positive import root
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -16,6 +17,7 @@ from ipjax.confidence import covariance, find_rival, loosest_turn, pair_informat
 from ipjax.config import Config
 from ipjax.features import identity_of, lift, object_features
 from ipjax.matching import match, select
+from ipjax.metrics import turn_angle
 from ipjax.refinement import Cloud, information, refine, settle, trace_contour
 from ipjax.scoring import score, seen_share
 from ipjax.types import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
@@ -88,9 +90,9 @@ def estimate(
     offset = jax.vmap(lambda one: best.poses @ one.object - one.camera)(pairs)
     squared = jnp.sum(offset**2, axis=-1)
     near = (pairs.weight > 0) & (squared < (config.align.threshold * best.poses.scale) ** 2) & best.determined
-    view = jnp.argmax(jnp.sum(near, axis=1))
+    view = lax.argmax(jnp.sum(near, axis=1, dtype=jnp.int32), 0, jnp.int32)
     matched, squared, used = jax.tree.map(lambda x: x[view], (pairs, squared, near))
-    count = jnp.sum(used)
+    count = jnp.sum(used, dtype=jnp.int32)
     with jax.named_scope("confidence"):
         sure = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
     found = PoseEstimate(
@@ -100,7 +102,7 @@ def estimate(
         view=matches.view[view],
         view_score=matches.ranking,
         inliers=count,
-        rmse=jnp.sqrt(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
+        rmse=root(jnp.sum(jnp.where(used, squared, 0)) / jnp.maximum(count, 1).astype(squared.dtype)),
         success=best.determined,
     )
     return finite_estimate(found)
@@ -233,7 +235,7 @@ class _Scene(eqx.Module):
 
 def _extent(mask: Bool[Array, "h w"], depth: Float[Array, "h w"], camera: Camera) -> Float[Array, ""]:
     """The root of the area that the mask covers, metres: how large things are here, roughly."""
-    return jnp.sqrt(jnp.sum(jnp.where(mask, depth, 0) ** 2) / (camera.focal[0] * camera.focal[1]))
+    return root(jnp.sum(jnp.where(mask, depth, 0) ** 2) / (camera.focal[0] * camera.focal[1]))
 
 
 def _rounds(
@@ -319,9 +321,8 @@ def distinct(
     def choose(rest, _):
         best = jnp.argmax(rest)
         trace = jnp.sum(poses.rotation * poses.rotation[best], axis=(-2, -1))
-        turned = jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1))
-        moved = jnp.linalg.norm(poses.translation - poses.translation[best], axis=-1)
-        same = (turned < apart) & (moved < 0.03 * poses.scale[best])
+        moved = root(jnp.sum((poses.translation - poses.translation[best]) ** 2, axis=-1))
+        same = (turn_angle(trace) < apart) & (moved < 0.03 * poses.scale[best])
         return jnp.where(same, -1, rest).at[best].set(-1), (best, rest[best] >= 0)
 
     return lax.scan(choose, score, None, length=count)[1]
@@ -338,7 +339,7 @@ def turn(poses: Similarity, axes: Float[Array, "3 3"]) -> Similarity:
     quarter = np.array(
         [[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]]
     )
-    turns = np.concatenate([np.linalg.matrix_power(quarter, k) for k in (1, 2, 3)]).astype(np.float32)
+    turns = np.concatenate([np.linalg.matrix_power(quarter, k) for k in (1, 2, 3)]).astype(axes.dtype)
     about = jnp.einsum("ki,tkl,lj->tij", axes, turns, axes, precision="highest")
     rotation = jnp.einsum("nij,tjk->ntik", poses.rotation, about, precision="highest").reshape(-1, 3, 3)
     repeat = lambda x: jnp.repeat(x, len(turns), axis=0)
@@ -378,7 +379,7 @@ def apparent_diameter(templates: Templates, query: Query) -> Float[Array, "v"]:
     )
     depth = jnp.where(templates.patches.valid, inside, 0)
     expected = jnp.sum((depth / jnp.mean(templates.camera.focal, axis=-1)[..., None]) ** 2, axis=-1)
-    return jnp.sqrt(seen / jnp.maximum(expected, 1e-9))
+    return root(seen / jnp.maximum(expected, 1e-9))
 
 
 def _depth_in_camera(pose: Similarity, points: Float[Array, "p 3"]) -> Float[Array, "p"]:

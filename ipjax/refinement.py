@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import lineax as lx
 import numpy as np
 import optimistix as optx
-from ipjax_kernels.positive import solve_positive
+from ipjax_kernels.positive import invert_semidefinite, root, solve_positive
 from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
@@ -69,7 +69,7 @@ def trace_contour(
 
     # Edge padding: at the image's border the object goes on.
     smooth = jnp.pad(cover, reach + 1, mode="edge")
-    binomial = np.array([1, 4, 6, 4, 1], np.float32) / 16
+    binomial = np.array([1, 4, 6, 4, 1], depth.dtype) / 16
     smooth = jnp.sum(jnp.stack([w * smooth[i : i + height + 2] for i, w in enumerate(binomial)]), axis=0)
     smooth = jnp.sum(jnp.stack([w * smooth[:, i : i + width + 2] for i, w in enumerate(binomial)]), axis=0)
     slope = jnp.stack([smooth[1:-1, :-2] - smooth[1:-1, 2:], smooth[:-2, 1:-1] - smooth[2:, 1:-1]], axis=-1)
@@ -118,6 +118,11 @@ def refine(
 ) -> tuple[Similarity, Float[Array, ""]]:
     """Improve one hypothesis; the caller vmaps.
 
+    Differentiable in both modes with respect to all but the hypothesis, by the implicit function theorem: a minimum
+    does not depend on where the search for it began. Which point is compared with which is held as it is. The
+    derivative is that of the minimum where ``config.steps`` reached one; elsewhere it is that of one Newton step from
+    the pose returned, finite but of a pose not yet found. Without steps the pose passes through, its derivative too.
+
     Args:
       surface: the object's surface; its first ``config.points`` points are fitted to the depth, all to the mask.
       cloud: the masked depth, and what lies around it.
@@ -127,9 +132,7 @@ def refine(
     Returns:
       The refined similarity, never with a larger cost than the given one, and its mean robust cost in [0, 1].
     """
-    step, before, after = _fit(surface, cloud, camera_from_object, None, config, rigid=6 if scale_known else 7)
-    better = after < before
-    return retract(camera_from_object, jnp.where(better, step, 0)), jnp.where(better, after, before)
+    return _fit(surface, cloud, camera_from_object, None, config, rigid=6 if scale_known else 7)[:2]
 
 
 def settle(
@@ -159,15 +162,12 @@ def settle(
     width = jnp.maximum(config.width, config.forgiveness * unevenness(surface, cloud, camera_from_object, config))
     wider = width / config.width
 
-    def fit(strain, wider, pair_weight, fixed_widths):
+    def fit(strain, wider, pair_weight, unit):
         reach = jnp.maximum(config.reach, 2 * config.width * wider)
         changed = strain, config.width * wider, reach, config.silhouette_width * wider, pair_weight
         fields = lambda c: (c.strain, c.width, c.reach, c.silhouette_width, c.pair_weight)
         allowed = eqx.tree_at(fields, config, changed)
-        step, before, after = _fit(
-            surface, cloud, camera_from_object, pairs, allowed, rigid=rigid, strains=STRAINS, fixed_widths=fixed_widths
-        )
-        return step[:rigid], before, after
+        return _fit(surface, cloud, camera_from_object, pairs, allowed, unit, rigid=rigid, strains=STRAINS)
 
     # One body for both ways, so that it is compiled once: proportions give way, or (all but) nothing does.
     one = jnp.ones_like(width)
@@ -175,13 +175,11 @@ def settle(
         jnp.stack([config.strain * one, 1e-3 * config.strain * one]),
         jnp.stack([one, wider]),
         jnp.stack([0 * one, config.pair_weight * (1 - wider**-2.0)]),
-        jnp.array([True, False]),
+        jnp.stack([camera_from_object.scale, 0 * one]),
     )
-    steps, before, after = jax.vmap(fit)(*ways)
-    better = after < before
+    poses, after, before = jax.vmap(fit)(*ways)
     strained_enough = after[0] < before[0] * (1 - config.gain)
-    step = jnp.where(strained_enough, steps[0], jnp.where(better[1], steps[1], 0))
-    return retract(camera_from_object, step)
+    return jax.tree.map(lambda both: jnp.where(strained_enough, both[0], both[1]), poses)
 
 
 STRAINS = 5  # of a symmetric matrix without a trace
@@ -214,35 +212,82 @@ def _fit(
     start: Similarity,
     pairs: Pairs | None,
     config: RefineConfig,
+    unit: Float[Array, ""] | None = None,
     *,
     rigid: int,
     strains: int = 0,
-    fixed_widths: Bool[Array, ""] | None = None,
-) -> tuple[Float[Array, "n"], Float[Array, ""], Float[Array, ""]]:
-    """The step of least squares from a pose, ``rigid`` coordinates of :func:`retract` and then strains, and the cost
-    before and after it; infinite, and a step of zeros, where it is not finite.
+) -> tuple[Similarity, Float[Array, ""], Float[Array, ""]]:
+    """The pose of least squares, its mean robust cost and the start's; the start where nothing finite is better.
 
-    The widths of the losses are in diameters of the pose in hand; with ``fixed_widths``, of the start.
+    Free are ``rigid`` coordinates of :func:`retract` and then strains. ``unit``: as for :func:`_terms`.
     """
+    given = surface, cloud, pairs, config, jnp.zeros_like(start.scale) if unit is None else unit
+    if not config.steps:
+        cost = _cost(start, jnp.zeros(rigid + strains, start.translation.dtype), *given, rigid=rigid)
+        return start, cost, cost
+    # Nothing of the derivative goes through the start, and the graph need not hold what it would be multiplied by.
+    pose, _, cost, before = _search(rigid, strains, lax.stop_gradient(start), *given)
+    return pose, cost, before
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _search(rigid, strains, start, surface, cloud, pairs, config, unit):
+    """The pose, the strain, their cost and the start's; the derivative is that of the minimum that they are at."""
+    given = surface, cloud, pairs, config, unit
     zero = jnp.zeros(rigid + strains, start.translation.dtype)
 
     def linear(step, _):
         here = lax.stop_gradient(step)
-        value, slopes = _linearise(start, here, surface, cloud, pairs, config, fixed_widths, rigid=rigid)
+        value, slopes = _linearise(start, here, *given, rigid=rigid)
         # What the solver differentiates is linear; the added zero has the slopes.
         return value + jnp.sum(slopes * (step - here), axis=1)
 
-    def cost(values):  # the prior adds to it but is no residual of the image
-        return jnp.sum(values**2) / (values.shape[0] - strains)
-
-    before = cost(_linearise(start, zero, surface, cloud, pairs, config, fixed_widths, rigid=rigid)[0])
-    if not config.steps:
-        return zero, before, before
+    before = _mean_square(_linearise(start, zero, *given, rigid=rigid)[0], strains)
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
+    solver = eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
     solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
-    after = cost(solution.state.f_info.residual)
-    fine = jnp.isfinite(after)
-    return jnp.where(fine, solution.value, 0), before, jnp.where(fine, after, jnp.inf)
+    after = _mean_square(solution.state.f_info.residual, strains)
+    better = after < before  # false where it is not finite
+    step = jnp.where(better, solution.value, 0)
+    return retract(start, step[:rigid]), step[rigid:], jnp.where(better, after, before), before
+
+
+@_search.defjvp
+def _differentiate_search(rigid, strains, primals, tangents):
+    # At a minimum the slope of the cost is zero, and stays so: H step' + (slope of the cost)' = 0. With H exact, not
+    # Gauss and Newton's: the losses bend, and what residuals are left bends them more.
+    found = _search(rigid, strains, *primals)
+    pose, strain, _, _ = found
+    given, changes = primals[1:], tangents[1:]
+    zero = jnp.zeros(rigid + strains, pose.translation.dtype)
+    start = jnp.concatenate([zero[:rigid], strain])
+
+    def cost(step, given):
+        return _cost(pose, start + step, *given, rigid=rigid)
+
+    slope = jax.grad(cost)
+    hessian = jax.jacfwd(slope)(zero, given)
+    (cost_change, slope_change) = jax.jvp(lambda given: jax.value_and_grad(cost)(zero, given), (given,), (changes,))[1]
+    step_change = -jnp.sum(invert_semidefinite(hessian) * slope_change, axis=1)
+    move = lambda step: (retract(pose, step[:rigid]), strain + step[rigid:])
+    pose_change, strain_change = jax.jvp(move, (zero,), (step_change,))[1]
+    return found, (pose_change, strain_change, cost_change, jnp.zeros_like(cost_change))
+
+
+def _cost(start, step, surface, cloud, pairs, config, unit, *, rigid):
+    strains = step.shape[0] - rigid
+    return _mean_square(_terms(start, step, surface, cloud, pairs, config, unit, rigid=rigid), strains)
+
+
+def _mean_square(values, strains):  # the prior adds to it but is no residual of the image
+    return jnp.sum(values**2) / (values.shape[0] - strains)
+
+
+class _TrustRegion(optx.ClassicalTrustRegion):
+    """Optimistix's, in the precision of the residuals; its own is the default precision."""
+
+    def init(self, y, f_info_struct):
+        return jax.tree.map(lambda x: x.astype(y.dtype), super().init(y, f_info_struct))
 
 
 @functools.partial(jax.jit, static_argnames="rigid")  # so that it is traced once
@@ -253,33 +298,50 @@ def _linearise(
     cloud: Cloud,
     pairs: Pairs | None,
     config: RefineConfig,
-    fixed_widths: Bool[Array, ""] | None = None,
+    unit: Float[Array, ""],
     *,
     rigid: int,
 ) -> tuple[Float[Array, "r"], Float[Array, "r n"]]:
-    """The residuals after a step of ``rigid`` coordinates of :func:`retract` and then strains, and their slopes.
+    """The residuals of :func:`_terms` and their slopes.
 
     All slopes at once: left to the solver, they are a function that it carries through its loop, which takes twice as
     long to compile.
     """
 
     def residuals(step):
-        moved, strain = retract(start, step[:rigid]), step[rigid:]
-        deformed, matched = surface, pairs
-        if strain.shape[0]:
-            deformed = strained(surface, strain)
-        if strain.shape[0] and matched is not None:
-            matched = eqx.tree_at(lambda p: p.object, matched, matched.object + _stretch(matched.object, strain))
-        unit = moved.scale if fixed_widths is None else jnp.where(fixed_widths, start.scale, moved.scale)
-        values = _residuals(moved, unit, deformed, cloud, matched, config)
-        # So that the mean square is in [0, 1].
-        spread = jnp.sqrt(values.shape[0] / _weight(config, pairs, step.dtype))
-        # One standard deviation costs as much as if a hundredth of the surface were lost.
-        values = jnp.concatenate([values * spread, strain / config.strain * (0.1 * spread)])
+        values = _terms(start, step, surface, cloud, pairs, config, unit, rigid=rigid)
         return values, values
 
     slopes, values = jax.jacfwd(residuals, has_aux=True)(step)
     return values, slopes
+
+
+def _terms(
+    start: Similarity,
+    step: Float[Array, "n"],
+    surface: Surface,
+    cloud: Cloud,
+    pairs: Pairs | None,
+    config: RefineConfig,
+    unit: Float[Array, ""],
+    *,
+    rigid: int,
+) -> Float[Array, "r"]:
+    """The residuals after a step of ``rigid`` coordinates of :func:`retract` and then strains.
+
+    Args:
+      unit: metres in a diameter of the losses' widths; 0 = that of the pose in hand.
+    """
+    moved, strain = retract(start, step[:rigid]), step[rigid:]
+    if strain.shape[0]:
+        surface = strained(surface, strain)
+    if strain.shape[0] and pairs is not None:
+        pairs = eqx.tree_at(lambda p: p.object, pairs, pairs.object + _stretch(pairs.object, strain))
+    values = _residuals(moved, jnp.where(unit > 0, unit, moved.scale), surface, cloud, pairs, config)
+    # So that the mean square is in [0, 1].
+    spread = jnp.sqrt(values.shape[0] / _weight(config, pairs, step.dtype))
+    # One standard deviation costs as much as if a hundredth of the surface were lost.
+    return jnp.concatenate([values * spread, strain / config.strain * (0.1 * spread)])
 
 
 def strained(surface: Surface, strain: Float[Array, "5"]) -> Surface:
@@ -314,7 +376,8 @@ def information(
     Each kind of residual (surface to depth, depth to surface, silhouette) is averaged: their number does not matter.
     """
     zero = jnp.zeros(7, camera_from_object.translation.dtype)
-    values, slopes = _linearise(camera_from_object, zero, surface, cloud, None, config, rigid=7)
+    unit = jnp.zeros_like(camera_from_object.scale)
+    values, slopes = _linearise(camera_from_object, zero, surface, cloud, None, config, unit, rigid=7)
     # Its terms add up to the mean square, here to the sum.
     share = _weight(config, None, zero.dtype) / values.shape[0]
     return jnp.sum(slopes[:, :, None] * slopes[:, None, :], axis=0) * share, jnp.sum(values**2) * share
@@ -359,15 +422,15 @@ def _pair_terms(moved, unit, pairs, config):
     """Geman–McClure on the distance between the two points of each pair; the squares sum to at most the weight."""
     squared = jnp.sum((moved @ pairs.object - pairs.camera) ** 2, axis=-1) / (config.pair_width * unit) ** 2
     share = pairs.weight * jnp.asarray(config.pair_weight, squared.dtype) / jnp.maximum(jnp.sum(pairs.weight), 1e-9)
-    return jnp.sqrt(squared / (1 + squared) + 1e-12) * jnp.sqrt(share)
+    return jnp.sqrt(squared / (1 + squared) + 1e-12) * root(share)
 
 
 def _place(moved, points, normals):
     """Points and normals in the camera frame, and which of them show it their front."""
     placed = moved @ points
     facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
-    distance = jnp.linalg.norm(placed, axis=-1)
-    return placed, facing, lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * distance)
+    seen = lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * jnp.linalg.norm(placed, axis=-1))
+    return placed, facing, seen
 
 
 def _depth_terms(moved, unit, points, normals, trust, cloud, config):
@@ -394,7 +457,7 @@ def _depth_terms(moved, unit, points, normals, trust, cloud, config):
 
 
 def _averaged(values, count):
-    return values * jnp.sqrt(1 / jnp.maximum(count, 1)).astype(values.dtype)
+    return values * jnp.sqrt(1 / jnp.maximum(count.astype(values.dtype), 1))
 
 
 def _silhouette(moved, unit, points, cloud, config):

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+from ipjax_kernels.positive import root
 from ipjax_kernels.rasterize import splat_colours, splat_depth
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from ipjax.cameras import project, resize_pixels
 from ipjax.config import ScoreConfig
 from ipjax.features import object_features
+from ipjax.metrics import turn_angle
 from ipjax.types import Agreement, Camera, Patches, Query, Similarity, Surface, Templates
 
 
@@ -79,7 +81,7 @@ def depth_agreement(
     agree = seen & known & mask & (jnp.abs(gap) <= tolerance)
     occluded = seen & ~mask & (~known | (gap < tolerance))
     union = (seen & ~occluded) | (mask & known)
-    return jnp.sum(agree) / jnp.maximum(jnp.sum(union), 1)
+    return jnp.sum(agree, dtype=depth.dtype) / jnp.maximum(jnp.sum(union, dtype=depth.dtype), 1)
 
 
 def seen_share(surface: Surface, camera_from_object: Similarity) -> Float[Array, ""]:
@@ -98,10 +100,11 @@ def closeness(templates: Templates, camera_from_object: Similarity) -> Float[Arr
 
     The hypothesis is turned to the optical axis first: what an off-axis object looks like depends on its ray.
     """
-    ray = camera_from_object.translation / jnp.maximum(jnp.linalg.norm(camera_from_object.translation), 1e-9)
+    distance = root(jnp.sum(camera_from_object.translation**2))
+    ray = camera_from_object.translation / jnp.maximum(distance, 1e-9)
     turned = jnp.sum(look_along(ray)[:, :, None] * camera_from_object.rotation[None], axis=1)
     trace = jnp.sum(templates.camera_from_object.rotation * turned, axis=(-2, -1))
-    return jnp.arccos(jnp.clip((trace - 1) / 2, -1, 1))
+    return turn_angle(trace)
 
 
 def look_along(ray: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -142,12 +142,12 @@ def test_widths_fixed_in_metres_do_not_reward_growth(scene):
     surface, cloud, truth = scene
     grown = jnp.array([0, 0, 0, 0, 0, 0, 0.1], jnp.float32)
     bumpy = uneven(surface, 0, 0.03)
+    units = truth.scale, 0 * truth.scale
     fixed, relative = (
-        np.asarray(_linearise(truth, grown, bumpy, cloud, None, CONFIG, jnp.array(fixed), rigid=7)[0])
-        for fixed in (True, False)
+        np.asarray(_linearise(truth, grown, bumpy, cloud, None, CONFIG, unit, rigid=7)[0]) for unit in units
     )
     assert np.sum(fixed**2) > 1.02 * np.sum(relative**2)
-    there = [_linearise(truth, 0 * grown, bumpy, cloud, None, CONFIG, jnp.array(h), rigid=7)[0] for h in (True, False)]
+    there = [_linearise(truth, 0 * grown, bumpy, cloud, None, CONFIG, unit, rigid=7)[0] for unit in units]
     np.testing.assert_array_equal(*there)  # at the start both are the same
 
 

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ipjax_kernels.positive import root
+
 _SHARES = (0.375, 0.5, 0.625, 0.75)  # of the query's patches: what its valid ones are cut to, if they fit
 _LEAST = 64  # patches; fewer are not worth the branches
 NO_MATCH = -2.0  # the similarity of a patch that has no neighbour: finite, and below every cosine
@@ -113,7 +115,7 @@ def cycle_distance(
             f"got {query_to_template.shape}, {template_to_query.shape} and {grid.shape}"
         )
     back = template_to_query[query_to_template]
-    distance = jnp.sqrt(jnp.sum((grid - grid[back]) ** 2, axis=-1))
+    distance = root(jnp.sum((grid - grid[back]) ** 2, axis=-1))
     return jnp.where(query_valid & template_valid[query_to_template], distance, jnp.inf)
 
 

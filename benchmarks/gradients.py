@@ -1,0 +1,105 @@
+"""``python -m benchmarks.gradients``: derivatives of pose, size and confidence beside differences of whole solutions.
+
+The cost of refinement has steps wherever a point changes what it is compared with, and its minima lie against them. So
+differences over tiny changes tell of steps alone. Here each difference is the slope of a parabola through solutions at
+many changes, with its standard error; everything in float64.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import ipjax
+from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
+from ipjax.metrics import turn_angle
+
+sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
+import problems
+
+CONFIG = Config(
+    match=MatchConfig(views=2, pairs=64),
+    align=AlignConfig(count=128),
+    refine=RefineConfig(points=1024),
+    score=ScoreConfig(alternates=0),
+)
+WHAT = ("tx", "ty", "tz", "log size", "turn x", "turn y", "turn z", "confidence")
+
+
+def widen(records):
+    """The same numbers in float64."""
+    return jax.tree.map(lambda x: x.astype(jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x, records)
+
+
+def change(name, amount, templates, query):
+    """The records after a change of one kind: of the depth or surface in diameters, of features in their norm."""
+    depth, features = query.view.depth, query.patches.features
+    side = jnp.linspace(0, 1, depth.shape[0], dtype=depth.dtype)
+    if name in ("depth", "depth, waves"):
+        wave = 1.0 if name == "depth" else jnp.cos(6 * side)[:, None] * jnp.sin(3 * side)[None]
+        depth = jnp.where(depth > 0, depth + amount * wave, 0)
+        points = query.patches.points * (1 + amount / jnp.maximum(query.patches.points[:, 2:], 1e-6))
+        return templates, eqx.tree_at(lambda q: (q.view.depth, q.patches.points), query, (depth, points))
+    if name == "features":
+        noise = jnp.asarray(np.random.default_rng(0).normal(size=features.shape), features.dtype)
+        return templates, eqx.tree_at(lambda q: q.patches.features, query, features + amount * noise)
+    surface = templates.surface
+    if name == "surface, size":
+        points = surface.points * (1 + amount)
+    else:
+        points = surface.points + amount * surface.normals * jnp.sin(5 * surface.points[:, :1])
+    return eqx.tree_at(lambda t: t.surface.points, templates, points), query
+
+
+CHANGES = {"depth": 0.01, "depth, waves": 0.01, "features": 0.02, "surface, size": 0.02, "surface, waves": 0.01}
+
+
+def tell(name, amount, templates, query, start):
+    """Where the estimate is after a change, relative to ``start``: diameters, logarithm, rad; and its confidence."""
+    found = ipjax.estimate(None, *change(name, amount, templates, query), jax.random.key(0), CONFIG)
+    pose = found.camera_from_object
+    shift = (pose.translation - start.translation) / start.scale
+    turn = pose.rotation @ start.rotation.T
+    vector = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    size = jnp.log(pose.scale / start.scale)
+    return jnp.concatenate([shift, size[None], vector, found.confidence[None]]), turn_angle(jnp.trace(turn))
+
+
+def rows(seed: int, count: int):
+    """For each kind of change: the derivative of everything told, the differences', and their standard errors."""
+    templates, (query, truth) = problems.make_templates(), problems.make_query(seed, noise=0.3)
+    dense = eqx.tree_at(lambda t: t.surface, templates, problems.make_surface(2048))
+    templates, query, truth = widen((dense, query, truth))
+    start = jax.jit(ipjax.estimate)(None, templates, query, jax.random.key(0), CONFIG).camera_from_object
+    for name, reach in CHANGES.items():
+        unit = float(truth.scale) if name.startswith("depth") else 1.0
+        told = lambda amount, name=name: tell(name, amount, templates, query, start)[0]
+        both = jax.jit(lambda amount, told=told: jax.jvp(told, (amount,), (jnp.ones_like(amount),)))
+        amounts = np.linspace(-reach, reach, count) * unit
+        derivative = np.asarray(both(jnp.zeros(()))[1]) * unit
+        values = np.stack([np.asarray(both(jnp.asarray(amount))[0]) for amount in amounts])
+        basis = np.stack([np.ones(count), amounts / unit, (amounts / unit) ** 2], axis=1)
+        fitted, *_ = np.linalg.lstsq(basis, values, rcond=None)
+        variance = np.sum((values - basis @ fitted) ** 2, axis=0) / (count - 3)
+        yield name, derivative, fitted[1], np.sqrt(variance / np.sum((amounts / unit) ** 2))
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gradients", description=__doc__.split("\n")[0])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[4], help="scenes; default: 4")
+    parser.add_argument("--count", type=int, default=24, help="solutions per difference; default: 24")
+    options = parser.parse_args()
+    with jax.enable_x64(True):
+        print("| scene | change | | " + " | ".join(WHAT) + " |\n" + "|---" * (3 + len(WHAT)) + "|")
+        for seed in options.seeds:
+            for name, *numbers in rows(seed, options.count):
+                for kind, line in zip(("derivative", "differences", "± standard error"), numbers, strict=True):
+                    print(f"| {seed} | {name} | {kind} | " + " | ".join(f"{x:.3f}" for x in line) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
