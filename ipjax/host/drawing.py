@@ -66,14 +66,15 @@ def gather_evidence(
     q, t = matches.query[0][kept], matches.template[0][kept]
     height, width = query.view.mask.shape
     crop_grid, template_grid = np.asarray(query.patches.grid), np.asarray(one.patches.grid[0])
-    columns, rows = crop_grid.max(axis=0) + 1
+    columns, rows = (int(side) + 1 for side in crop_grid.max(axis=0))
+    cells = (int(template_grid[:, 0].max()) + 1, int(template_grid[:, 1].max()) + 1)
     moved = _transform(estimate.camera_from_object, np.asarray(one.patches.points[0])[t])
     residual = np.linalg.norm(moved - np.asarray(query.patches.points)[q], axis=-1)
     return Evidence(
         crop=np.asarray(query.view.rgb),
         template=info.picture(view),
         crop_points=resize_pixels(crop_grid[q], (columns, rows), (width, height)),
-        template_points=resize_pixels(template_grid[t], tuple(template_grid.max(axis=0) + 1), (1, 1)),
+        template_points=resize_pixels(template_grid[t], cells, (1, 1)),
         inlier=residual <= float(config.align.threshold) * float(estimate.camera_from_object.scale),
     )
 
