@@ -227,6 +227,25 @@ def test_nodes_place_mirror_and_repeat_what_they_show(tmp_path):
     assert len(load_mesh(gltf.save(tmp_path / "three.glb")).faces) == 36
 
 
+def test_nodes_morph_the_mesh_that_they_share_each_in_its_own_way(tmp_path):
+    gltf = Gltf()
+    shift = gltf.put(np.tile(np.array([[10, 0, 0]], "<f4"), (24, 1)))
+    gltf.draw(material=gltf.skin(), TEXCOORD_0=gltf.uv())["targets"] = [{"POSITION": shift}]
+    gltf.tree["meshes"][0]["weights"] = [0.25]
+    gltf.tree["nodes"] = [{"mesh": 0, "weights": [0]}, {"mesh": 0, "weights": [1]}, {"mesh": 0}]
+    gltf.tree["scenes"] = [{"nodes": [0, 1, 2]}]
+    mesh = load_mesh(gltf.save(tmp_path / "box.glb"))
+    places = np.unique(mesh.vertices[:, 0])
+    np.testing.assert_allclose(places, np.sort([x + side for x in (0, 2.5, 10) for side in (-1, 1)]))
+
+
+def test_an_extension_without_an_image_leaves_the_usual_one(tmp_path):
+    gltf = Gltf()
+    gltf.draw(material=gltf.skin(), TEXCOORD_0=gltf.uv())
+    gltf.tree["textures"][0]["extensions"] = {"EXT_texture_webp": {}}
+    check_box(load_mesh(gltf.save(tmp_path / "box.glb")))
+
+
 def test_what_is_required_and_not_handled_is_refused_by_name(tmp_path):
     for name in ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_texture_basisu", "ACME_shape"):
         gltf = Gltf()
@@ -455,6 +474,24 @@ def test_names_in_any_encoding(tmp_path, encoding, name):
     check_box(load_mesh(tmp_path / "box.obj"))
 
 
+MARK = b"\xef\xbb\xbf"
+
+
+def test_a_byte_order_mark_is_no_part_of_a_text(tmp_path):
+    """Without its first line an OBJ would lose its materials, or its first vertex."""
+    (tmp_path / "t.png").write_bytes(encode())
+    (tmp_path / "box.mtl").write_bytes(MARK + b"newmtl m\nmap_Kd t.png\n")
+    for head in ("mtllib box.mtl\nusemtl m", ""):
+        path = write_obj(tmp_path / "box.obj", head=head, colours=COLOURS)
+        path.write_bytes(MARK + path.read_bytes())
+        with warnings.catch_warnings():
+            warnings.simplefilter("error" if head else "ignore")
+            check_box(load_mesh(path))
+    path = write_ply(tmp_path / "box.ply", PAINTED, [(q,) for q in QUADS], face=["vertex_indices uchar int"])
+    path.write_bytes(MARK + path.read_bytes())
+    check_box(load_mesh(path))
+
+
 @pytest.mark.parametrize("image", ["box.png", "texture.png", "box_albedo.jpg", "Box.PNG", "material_0.png"])
 @pytest.mark.parametrize("kind", ["obj", "ply"])
 def test_the_image_beside_a_mesh_is_taken_where_its_name_says_so(tmp_path, image, kind):
@@ -540,6 +577,7 @@ def test_vertices_between_faces_that_count_backwards(tmp_path):
 # --- PLY -----------------------------------------------------------------------------------------------------------
 
 NAMES = [("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b")]
+PAINTED = [*zip("xyz", ["float"] * 3, VERTICES.T, strict=True), *zip(NAMES[0], ["uchar"] * 3, COLOURS.T, strict=True)]
 TOPS = {"uchar": 255, "ushort": 65535, "float": 1, "double": 1, "int": 255}
 
 
@@ -609,6 +647,33 @@ def test_colours_of_faces_and_strips(tmp_path):
     check_box(load_mesh(path), atol=0)
 
 
+def test_rows_of_many_lengths_stay_in_order(tmp_path):
+    """Words behind a row, and lists of vertices, do not reorder the vertices that faces count."""
+    path = write_ply(tmp_path / "box.ply", PAINTED, [(q,) for q in QUADS], face=["vertex_indices uchar int"])
+    lines = path.read_text().split("\n")
+    first = lines.index("end_header") + 1
+    for i in range(0, 24, 3):
+        lines[first + i] += " 0" * (i % 4 + 1)
+    (tmp_path / "words.ply").write_text("\n".join(lines))
+    check_box(load_mesh(tmp_path / "words.ply"), atol=0)
+    for form, order in (("ascii", None), ("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        kinds = ["property float x", "property float y", "property float z", "property list uchar short near"]
+        kinds += [f"property uchar {name}" for name in NAMES[0]]
+        head = ["ply", f"format {form} 1.0", "element vertex 24", *kinds]
+        head += ["element face 6", "property list uchar int vertex_indices", "end_header"]
+        data = ("\n".join(head) + "\n").encode()
+        for i in range(24):
+            near = [7] * (i % 3)
+            if order is None:
+                data += (" ".join(map(str, [*VERTICES[i], len(near), *near, *COLOURS[i]])) + "\n").encode()
+            else:
+                data += struct.pack(f"{order}3fB{len(near)}h3B", *VERTICES[i], len(near), *near, *COLOURS[i])
+        for quad in QUADS:
+            data += struct.pack(f"{order}B4i", 4, *quad) if order else f"4 {' '.join(map(str, quad))}\n".encode()
+        (tmp_path / "lists.ply").write_bytes(data)
+        check_box(load_mesh(tmp_path / "lists.ply"), atol=0)
+
+
 def test_clouds_are_told_apart(tmp_path):
     vertex = [*zip("xyz", ["float"] * 3, VERTICES.T, strict=True)]
     with pytest.raises(ValueError, match="point cloud"):
@@ -637,8 +702,9 @@ def test_text_stl_in_either_case_and_any_encoding(tmp_path, name, change):
         + b"\n"
         + change("endsolid").encode()
     )
-    (tmp_path / "box.stl").write_bytes(text)
-    check_box(load_mesh(tmp_path / "box.stl"), np.full((6, 3), 160))
+    for mark in (b"", MARK):
+        (tmp_path / "box.stl").write_bytes(mark + text)
+        check_box(load_mesh(tmp_path / "box.stl"), np.full((6, 3), 160))
     (tmp_path / "two.stl").write_bytes(text + b"\n" + text)
     assert len(load_mesh(tmp_path / "two.stl").faces) == 24
 
@@ -647,8 +713,16 @@ def test_text_stl_in_either_case_and_any_encoding(tmp_path, name, change):
 @pytest.mark.parametrize("name", ["box.stl", "box.STL"])
 def test_binary_stl_may_begin_like_text(tmp_path, head, name):
     record = b"".join(struct.pack("<12fH", 0, 0, 0, *VERTICES[face].ravel(), 0) for face in FACES)
-    (tmp_path / name).write_bytes(head.ljust(80) + struct.pack("<I", 12) + record)
-    check_box(load_mesh(tmp_path / name), np.full((6, 3), 160))
+    for behind in (b"", b"\r\n", b"\0" * 40):
+        (tmp_path / name).write_bytes(head.ljust(80) + struct.pack("<I", 12) + record + behind)
+        check_box(load_mesh(tmp_path / name), np.full((6, 3), 160))
+
+
+def test_faces_behind_those_that_binary_stl_promises_are_told(tmp_path):
+    record = b"".join(struct.pack("<12fH", 0, 0, 0, *VERTICES[face].ravel(), 0) for face in FACES)
+    (tmp_path / "box.stl").write_bytes(bytes(80) + struct.pack("<I", 10) + record)
+    with pytest.warns(UserWarning, match="promises 10 faces and has room for 12"):
+        assert len(load_mesh(tmp_path / "box.stl").faces) == 10
 
 
 # --- files of other people's reports ---------------------------------------------------------------------------------

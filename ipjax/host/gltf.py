@@ -40,6 +40,7 @@ HARMLESS = {
     "KHR_lights_punctual",
     "KHR_materials_anisotropy",
     "KHR_materials_clearcoat",
+    "KHR_materials_diffuse_transmission",
     "KHR_materials_dispersion",
     "KHR_materials_ior",
     "KHR_materials_iridescence",
@@ -113,7 +114,7 @@ class _Reader:
 
     def read(self) -> list[Part]:
         required = self.items("extensionsRequired")
-        unknown = [str(name) for name in required if name not in HANDLED | HARMLESS]
+        unknown = [str(name) for name in required if str_key(name) not in HANDLED | HARMLESS]
         if unknown:
             names = ", ".join(unknown[:4])[:200]
             compressed = any(name in COMPRESSED for name in unknown)
@@ -132,11 +133,12 @@ class _Reader:
                 break
         self.source.take_mesh(vertices, faces)
         parts = []
-        read: dict[int, list[Part]] = {}
+        read: dict[tuple[int, str], list[Part]] = {}
         for mesh, matrix, node in placed:
-            if mesh not in read:
-                read[mesh] = [drop_unused(self.primitive(item, mesh, node)) for item, _, m in shapes[mesh] if m]
-            for part in read[mesh]:
+            key = mesh, str(node.get("weights"))  # a node may morph its mesh in its own way
+            if key not in read:
+                read[key] = [drop_unused(self.primitive(item, mesh, node)) for item, _, m in shapes[mesh] if m]
+            for part in read[key]:
                 moved = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
                 # A mirroring node turns the faces inside out.
                 turned = part.faces[:, ::-1] if np.linalg.det(matrix[:3, :3]) < 0 else part.faces
@@ -488,8 +490,9 @@ class _Reader:
     def look(self, index: Any) -> Look:
         if index is None:
             return Look(plain=True)
+        entry = self.item("materials", index)
         if index not in self.looks:
-            self.looks[index] = self.material(self.item("materials", index))
+            self.looks[index] = self.material(entry)
         return self.looks[index]
 
     def material(self, entry: dict) -> Look:
@@ -546,7 +549,7 @@ class _Reader:
             turn = tuple(tuple(float(x) for x in row) for row in turn)
         entry = self.item("textures", info.get("index"))
         webp = self.extension(entry, "EXT_texture_webp")
-        source = entry.get("source") if webp is None else webp.get("source")
+        source = (webp or {}).get("source", entry.get("source"))
         if source is None:
             names = ", ".join(entry.get("extensions", {})) if isinstance(entry.get("extensions"), dict) else ""
             self.source.warn(f"a texture is only there in a form that is not read here ({names[:80]})")

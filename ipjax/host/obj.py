@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ipjax.host.parts import Part, Source, check_faces, drop_unused
+from ipjax.host.parts import MARK, Part, Source, check_faces, drop_unused
 from ipjax.host.textures import Texture
 
 BLOCK = 1 << 23  # bytes of text that are split at a time
@@ -47,7 +47,7 @@ class Table:
 
 def read_obj(source: Source) -> list[Part]:
     """The parts of an OBJ file, one per texture and one for what has none. Raises ValueError in a sentence."""
-    data = source.read()
+    data = source.read().removeprefix(MARK)
     source.take(len(data), "its text")
     vertices, places = Table(7), Table(2)
     faces: list[np.ndarray] = []  # [m 3 2]: vertex and place of every corner, from 0
@@ -247,7 +247,7 @@ def find_materials(source: Source, libraries: list[bytes], wanted: dict[bytes, i
 
 def read_mtl(source: Source, path: Path) -> dict[bytes, Material]:
     """The materials of an MTL file by their names, which are compared as bytes."""
-    data = source.read_beside(path)
+    data = source.read_beside(path).removeprefix(MARK)
     source.take(4 * len(data), path.name)
     found: dict[bytes, Material] = {}
     if data.startswith(b"version https://git-lfs"):

@@ -37,6 +37,7 @@ VERTEX_BYTES, FACE_BYTES = 240, 150  # of memory while a mesh is made
 GREY = 160
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff")
 LFS = b"version https://git-lfs"
+MARK = b"\xef\xbb\xbf"  # of UTF-8, which some editors put before a text
 
 
 @dataclasses.dataclass

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ipjax.host.parts import Part, Source, drop_unused
+from ipjax.host.parts import MARK, Part, Source, drop_unused
 from ipjax.host.textures import Texture
 
 KINDS = {
@@ -61,9 +61,9 @@ Group = tuple[np.ndarray, dict[str, np.ndarray]]
 
 def read_ply(source: Source) -> list[Part]:
     """The parts of a PLY file, one per texture. Raises ValueError in a sentence."""
-    data = source.read()
+    data = source.read().removeprefix(MARK)
     order, elements, images, start = read_header(data, source.size)
-    wanted = {"vertex", "face", "tristrips", "multi_texture_vertex", "multi_texture_face"}
+    wanted = {"vertex", "face", "tristrips"}
     found: dict[str, list[Group]] = {}
     total = sum(element.count for element in elements if element.name in ("vertex", "face", "tristrips"))
     source.take(64 * total + len(data), f"{total:,} rows")
@@ -77,7 +77,7 @@ def read_ply(source: Source) -> list[Part]:
             found[element.name] = groups
     if not found.get("vertex"):
         raise ValueError("the mesh is empty: it has no vertices")
-    table = found["vertex"][0][1]
+    table = order_rows(found["vertex"])
     if not any(name in found and found[name] for name in ("face", "tristrips")):
         if "f_dc_0" in table or "rot_0" in table:
             raise ValueError("is a cloud of Gaussians (a splat), which has no surface: export a mesh")
@@ -298,6 +298,15 @@ def row_layout(element: Element, lengths: tuple[int, ...], order: str) -> np.dty
         return np.dtype(fields)
     except ValueError:
         raise ValueError(f"has two properties of {element.name} with one name") from None
+
+
+def order_rows(groups: list[Group]) -> dict[str, np.ndarray]:
+    """The columns of all rows in the order of the file, without lists, which differ in length between groups."""
+    names = [name for name, column in groups[0][1].items() if column.ndim == 1]
+    if len(groups) == 1 and (np.diff(groups[0][0]) > 0).all():
+        return {name: groups[0][1][name] for name in names}
+    order = np.argsort(np.concatenate([numbers for numbers, _ in groups]))
+    return {name: np.concatenate([columns[name] for _, columns in groups])[order] for name in names}
 
 
 # --- what the rows mean ----------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 
-from ipjax.host.parts import Part, Source
+from ipjax.host.parts import MARK, Part, Source
 
 NUMBER = rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?|[+-]?nan|[+-]?inf"
 VERTEX = re.compile(rb"\bvertex\s+(%s)\s+(%s)\s+(%s)" % (NUMBER, NUMBER, NUMBER), re.IGNORECASE)
@@ -15,9 +15,12 @@ RECORD = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attrib
 def read_stl(source: Source) -> list[Part]:
     """One part without colour, three vertices a face. Raises ValueError in a sentence."""
     data = source.read()
+    text = data.removeprefix(MARK)
     count = struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
-    # Binary files may begin with "solid" too: then their length tells.
-    if len(data) != 84 + 50 * count and data[:512].lstrip()[:5].lower() == b"solid":
+    # Binary files may begin with "solid" too, and some have bytes behind their faces: a zero is in no text.
+    binary = len(data) == 84 + 50 * count or (count >= 0 and b"\0" in data[:512])
+    if not binary and text[:512].lstrip()[:5].lower() == b"solid":
+        data = text
         if not re.search(rb"\bfacet\b", data[:65536], re.IGNORECASE):
             raise ValueError("the mesh is empty: it has no facet")
         source.take(len(data), "its text")
@@ -42,6 +45,10 @@ def read_stl(source: Source) -> list[Part]:
             raise ValueError(f"promises {count} faces in {len(data)} bytes")
         if count == 0:
             raise ValueError("the mesh is empty: it has no faces")
+        if len(data) >= 84 + 50 * (count + 1):
+            source.warn(
+                f"it promises {count:,} faces and has room for {(len(data) - 84) // 50:,}: the rest is not shown"
+            )
         source.take_mesh(3 * count, count)
         vertices = np.frombuffer(data, RECORD, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     return [Part(vertices, np.arange(len(vertices)).reshape(-1, 3))]
