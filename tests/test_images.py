@@ -203,6 +203,17 @@ def test_tiffs_of_every_number_type(tmp_path, kind, order):
     assert found.dtype.isnative
 
 
+@pytest.mark.parametrize("largest", [200, 300, 4095, 10000, 65535])
+@pytest.mark.parametrize("comment", ["", "# 1 2 3\n"])
+def test_numbers_of_a_pgm_are_those_in_the_file(tmp_path, largest, comment):
+    values = np.arange(DEPTH.size).reshape(DEPTH.shape) % (largest + 1)
+    head = f"P5\n{comment}{values.shape[1]} {values.shape[0]}\n{largest}\n".encode()
+    (tmp_path / "d.pgm").write_bytes(head + values.astype("u1" if largest < 256 else ">u2").tobytes())
+    if largest > 255:
+        np.testing.assert_array_equal(read_depth(tmp_path / "d.pgm"), values)
+    np.testing.assert_array_equal(read_mask(tmp_path / "d.pgm", label=7), values == 7)
+
+
 @pytest.mark.parametrize(
     ("dtype", "sentinel", "scale"),
     [
@@ -235,6 +246,13 @@ def test_a_number_for_unknown_is_not_depth(dtype, sentinel, scale, share, caplog
         # The advice about the unit looks at what was measured.
         with pytest.raises(ValueError, match=f"median depth {np.median(known[known > 0]):.4g}: this looks like"):
             frame(RGB, depth, DISC, K)
+
+
+@pytest.mark.parametrize("behind", [65535, 2000])
+def test_a_flat_object_before_a_number_for_unknown_is_kept(behind):
+    depth = np.where(DISC, 300, behind).astype(np.uint16)
+    kept, said = forget_sentinel(depth)
+    assert (kept[DISC] == 300).all() and not kept[~DISC].any() and said.count("%") == 1
 
 
 def test_depth_that_only_looks_alike_is_kept():

@@ -4,6 +4,7 @@ Every reader raises one sentence of `ValueError` that names the file, and none a
 Depth keeps the number type of its file; its unit is settled in `frames.frame`, by ``depth_scale`` (metres per unit).
 """
 
+import re
 import struct
 import warnings
 from pathlib import Path
@@ -73,7 +74,7 @@ def read_depth(path: str | Path) -> np.ndarray:
             _check_upright(get_orientation(image), path)
             if image.mode not in ("I;16", "I;16B", "I;16L", "I;16N", "I", "F"):
                 raise ValueError(f"{path}: depth must be 16-bit or float with one channel, not 8-bit {image.mode}")
-            depth = np.array(image)
+            depth = _unstretched(image, path)
             if image.mode == "I" and depth.min() >= 0 and depth.max() < 65536:
                 depth = depth.astype(np.uint16)
     if depth.ndim == 3 and depth.shape[-1] == 1:
@@ -102,6 +103,8 @@ def read_mask(path: str | Path, label: int | None = None) -> np.ndarray:
         image = open_image(path)
         _check_upright(get_orientation(image), path)
         mask = _mask_values(image, label)
+        if label is not None and image.format == "PPM" and mask.ndim == 2:
+            mask = _unstretched(image, path)
     try:
         return as_mask(mask, label)
     except ValueError as error:
@@ -269,16 +272,17 @@ def forget_sentinel(depth: np.ndarray) -> tuple[np.ndarray, str]:
     if values.size == 0:
         return depth, ""
     found = []
-    for extreme, others in ((values.max(), np.max), (values.min(), np.min)):
+    for others in (np.max, np.min):
+        extreme = others(values)
         same = values == extreme
-        count = int(same.sum())
         rest = values[~same]
-        if count == 0 or rest.size == 0:
-            continue
+        if rest.size == 0:
+            break
         is_largest = others is np.max and float(extreme) in _LARGEST
         beyond = extreme >= 1.5 * others(rest) if others is np.max else extreme <= 0.2 * others(rest)
-        if is_largest or (count >= 0.05 * depth.size and beyond):
+        if is_largest or (same.sum() >= 0.05 * depth.size and beyond):
             found.append(extreme)
+            values = rest
     if not found:
         return depth, ""
     depth = depth.copy()
@@ -386,6 +390,19 @@ def _wide_tiff(path: Path) -> np.ndarray | None:
         name = {1: "unsigned", 2: "signed", 3: "floating-point"}.get(kind, "unknown")
         raise ValueError(f"{path}: a TIFF of {bits}-bit {name} numbers cannot be read; save it as 16-bit or float32")
     return depth
+
+
+def _unstretched(image: Image.Image, path: Path) -> np.ndarray:
+    """The numbers of a decoded image as its file has them: Pillow stretches those of a PGM to all of 8 or 16 bits."""
+    values = np.array(image)
+    if image.format != "PPM" or image.mode not in ("L", "I"):
+        return values
+    with path.open("rb") as file:
+        words = re.sub(rb"#[^\r\n]*", b" ", file.read(65536)).split(None, 4)
+    full = 255 if image.mode == "L" else 65535
+    if words[0] not in (b"P2", b"P5") or int(words[3]) == full:
+        return values
+    return np.round(values * (int(words[3]) / full)).astype(values.dtype)
 
 
 def _tiff_tags(path: Path) -> dict[int, int] | None:
