@@ -86,6 +86,11 @@ SAME = {  # the same camera with the same lens
     "flow.yaml": f"{{fx: {FX}, fy: {FY}, cx: {CX}, cy: {CY}, dist_coeffs: {D}, img_size: [{WIDTH}, {HEIGHT}]}}",
     "nested.json": dict(intrinsics=FOUR, distortion=dict(model="brown_conrady", coefficients=D), image=SIZE),
     "zeros behind.json": dict(K=FLAT, D=[*D, 0, 0, 0], distortion_model="plumb_bob", **SIZE),
+    "kc.json": dict(**FOUR, kc=D, **SIZE),
+    "rows of four.json": dict(intrinsic=[*([*row, 0.0] for row in K.tolist()), [0, 0, 0, 1]], D=D, **SIZE),
+    "one K in three forms.json": dict(
+        K=FLAT, cam_K=K.tolist(), camera_matrix=dict(rows=3, cols=3, data=FLAT), D=D, **SIZE
+    ),
     "upper.yaml": f"K: {FLAT}\nDistortion_Model: Plumb_Bob\nD: {D}\nWidth: {WIDTH}\nHeight: {HEIGHT}\n",
 }
 
@@ -98,6 +103,18 @@ def test_every_spelling_is_the_same_camera(tmp_path, name):
     np.testing.assert_allclose(camera.matrix, K)
     assert camera.distortion == tuple(D) and camera.lens in ("opencv", "plumb_bob")
     assert camera.size == (WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_numbers_in_rows_of_four_are_a_camera_where_they_move_nothing(tmp_path, count):
+    rows = np.eye(4)[:count]
+    rows[:3, :3] = K
+    np.savetxt(tmp_path / "k.txt", rows)
+    np.testing.assert_allclose(read_camera(tmp_path / "k.txt").matrix, K)
+    rows[0, 3] = -40.0  # the right camera of two
+    np.savetxt(tmp_path / "k.txt", rows)
+    with pytest.raises(ValueError, match="numbers are no camera"):
+        read_camera(tmp_path / "k.txt")
 
 
 FISHES = [

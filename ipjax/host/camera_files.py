@@ -87,7 +87,7 @@ _SIZE = re.compile(r"^(size|sizewh|resolution|res|dims?|dimensions?|widthheight|
 _SHAPE = re.compile(r"^(shape|heightwidth|hw)$")  # height first
 _COEFFICIENTS = re.compile(
     r"^(lens)?(d|dist|disto|distort|distortions?)(coefficients?|coeffs?|coefs?|params?|parameters?|vector|vec)?$"
-    r"|^(coefficients?|coeffs?|coefs?)$"
+    r"|^(coefficients?|coeffs?|coefs?|kc)$"
 )
 _MODEL = re.compile(r"^(dist(ortion)?(model|type|name)|projection(model|type|modeltype)?)$")
 _LOOSE_MODEL = re.compile(r"^(lens|lens(model|type)|model|type|modeltype|modelname)$")  # or the name of a device
@@ -282,6 +282,19 @@ def _matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
+def _matrix_from(array: np.ndarray) -> np.ndarray | None:
+    """K of fx, fy, cx, cy, of nine numbers row by row, or of rows of four that move nothing; None of others."""
+    if array.size == 4:
+        return _matrix_of(*array.reshape(-1))
+    if array.size == 9:
+        return array.reshape(3, 3)
+    if array.size in (12, 16):
+        rows = array.reshape(-1, 4)
+        if np.array_equal(rows[2:], np.eye(4)[2 : len(rows)]) and not rows[:2, 3].any():
+            return rows[:3, :3]
+    return None
+
+
 def _parse(text: str) -> Any:
     if not text.strip():
         raise ValueError("the file is empty")
@@ -300,10 +313,9 @@ def _from_entry(entry: Any, image: int | None) -> Intrinsics:
         if len(entry) == 1 and isinstance(entry[0], dict):
             return _from_entry(entry[0], image)
         array = _numbers(entry, "the camera")
-        if array.size == 4:
-            return Intrinsics(_matrix_of(*array.reshape(-1)))
-        if array.size == 9:
-            return Intrinsics(array.reshape(3, 3))
+        matrix = _matrix_from(array)
+        if matrix is not None:
+            return Intrinsics(matrix)
         raise ValueError(f"{array.size} numbers are no camera; fx fy cx cy, or nine numbers row by row, are expected")
     if not isinstance(entry, dict) or not entry:
         raise ValueError("no camera in it; BOP JSON, fx fy cx cy, or ROS CameraInfo is expected")
@@ -353,13 +365,25 @@ class _Fields:
         self.read.update(key for key, _ in found)
         found = [(key, value) for key, value in found if value is not None]
         for key, value in found[1:]:
-            if value != found[0][1]:
+            if not _agree(value, found[0][1]):
                 raise ValueError(f"{found[0][0]} and {key} say different things; keep the one that is right")
         return found[0][1] if found else None
 
     def rest(self) -> Iterator[tuple[str, str, Any]]:
         """What nobody asked for."""
         return (item for item in self.items if item[1] not in self.read)
+
+
+def _agree(one: Any, other: Any) -> bool:
+    """Whether two values say the same: a matrix may be a list of rows, of numbers, or a dictionary with data."""
+    lists = [value.get("data") if isinstance(value, dict) else value for value in (one, other)]
+    if all(isinstance(value, list) for value in lists):
+        try:
+            lists = [np.asarray(value, np.float64).ravel().tolist() for value in lists]
+        except (TypeError, ValueError, OverflowError):
+            return one == other
+        return lists[0] == lists[1]
+    return one == other
 
 
 _GROUPS = {
@@ -433,15 +457,12 @@ def _read_matrix(fields: _Fields) -> np.ndarray:
         if isinstance(given, dict):
             given = given.get("data", ())
         array = _numbers(given, "the camera matrix")
-        if array.size == 4:
-            matrix = _matrix_of(*array.reshape(-1))
-        elif array.size == 9:
-            matrix = array.reshape(3, 3)
-            if by_columns and np.array_equal(matrix[:2, 2], (0, 0)):  # Open3D writes it column by column
-                matrix = matrix.T
-            matrix = matrix.copy()
-        else:
+        matrix = _matrix_from(array)
+        if matrix is None:
             raise ValueError(f"the camera matrix has {array.size} entries instead of 9")
+        if by_columns and np.array_equal(matrix[:2, 2], (0, 0)):  # Open3D writes it column by column
+            matrix = matrix.T
+        matrix = matrix.copy()
     if all(number is None for number in numbers):
         assert matrix is not None
         return matrix
