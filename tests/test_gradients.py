@@ -19,8 +19,8 @@ import ipjax
 from ipjax.config import RefineConfig
 from ipjax.features import lift
 from ipjax.metrics import turn_angle
-from ipjax.refinement import Cloud, refine, rotation_from_vector, trace_contour
-from ipjax.types import Camera
+from ipjax.refinement import Cloud, refine, retract, rotation_from_vector, settle, trace_contour
+from ipjax.types import Camera, Pairs, Similarity
 
 GRID = 28
 
@@ -38,6 +38,55 @@ def look(query, shift=0.0) -> Cloud:
     valid, points = (cover > 0.3).reshape(GRID, GRID), points.reshape(GRID, GRID, 3)
     depth = jnp.where(valid, points[..., 2], 0)
     return Cloud(points, valid, camera, valid, depth, trace_contour(valid, depth, 0.03, 96))
+
+
+def tangent(pose: Similarity, start: Similarity):
+    """Coordinates of a pose near another: rotation, translation in diameters, logarithm of the size."""
+    turn = pose.rotation @ start.rotation.T
+    vector = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    shift = (pose.translation - start.translation) / start.scale
+    return jnp.concatenate([vector, shift, jnp.log(pose.scale / start.scale)[None]])
+
+
+# All depth is beyond the reach of losses this narrow, so that only pairs are left to fit: a cost without steps.
+OF_PAIRS = RefineConfig(width=1e-12, forgiveness=1e-6, reach=1e-12, pair_width=0.3)
+run_settle = jax.jit(lambda *given: settle(*given, OF_PAIRS))
+
+
+def test_the_minimum_moves_as_differences_say(x64):
+    """Object points, camera points and weights of pairs, to 5 %, in both modes."""
+    query, truth = widen(problems.make_query(4))
+    surface, cloud = widen(problems.make_surface(256)), look(query)
+    rng = np.random.default_rng(0)
+    uneven = surface.points + 0.01 * jnp.asarray(rng.normal(size=(256, 1))) * surface.normals
+    surface = eqx.tree_at(lambda s: s.points, surface, uneven)
+    chosen = rng.choice(256, 64, replace=False)
+    seen = truth @ surface.points[chosen] + 0.02 * truth.scale * jnp.asarray(rng.normal(size=(64, 3)))
+    pairs = Pairs(surface.points[chosen], seen, jnp.asarray(rng.uniform(0.2, 1, 64)))
+    directions = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape)), pairs)
+    directions = eqx.tree_at(lambda p: p.camera, directions, directions.camera * truth.scale)
+    directions = eqx.tree_at(lambda p: p.weight, directions, 10 * directions.weight)
+    kinds = [lambda p: p.object, lambda p: p.camera, lambda p: p.weight]
+
+    def found(amounts, start, times=1):
+        moved = pairs
+        for amount, kind in zip(amounts, kinds, strict=True):
+            moved = eqx.tree_at(kind, moved, kind(moved) + amount * kind(directions))
+        for _ in range(times):
+            start = run_settle(surface, cloud, start, moved)
+        return start
+
+    zero = jnp.zeros(3)
+    best = found(zero, retract(truth, jnp.asarray(rng.normal(size=7) * 0.02)), times=30)
+    assert float(jnp.max(jnp.abs(tangent(found(zero, best), best)))) < 5e-5  # it is a minimum
+    near = lambda amounts: tangent(found(amounts, best), best)
+    forward = np.asarray(jax.jacfwd(near)(zero))
+    told = lambda amounts: tangent(found(amounts, best, times=8), best)
+    step = 5e-3
+    differences = np.stack([(told(step * one) - told(-step * one)) / (2 * step) for one in np.eye(3)], axis=1)
+    assert np.abs(forward).max(axis=0).min() > 1e-3  # each of them moves it
+    assert np.all(np.abs(forward - differences) < 0.05 * np.abs(differences).max(axis=0))
+    np.testing.assert_allclose(np.asarray(jax.jacrev(near)(zero)), forward, atol=1e-9)
 
 
 run = jax.jit(lambda *given: refine(*given, RefineConfig(points=512)))
@@ -113,6 +162,31 @@ def test_confidence_follows_the_features(templates):
     differences = (sure(step) - sure(-step)) / (2 * step)
     assert abs(differences) > 0.01
     assert derivative == pytest.approx(differences, rel=0.05)
+
+
+def test_slopes_are_finite_everywhere(templates):
+    """Reverse mode through the whole estimate: nothing to see, no depth, no features, poses that are all the same."""
+    query, _ = problems.make_query(0, noise=0.3)
+    change = lambda where, record, make: eqx.tree_at(where, record, make(where(record)))
+    one = jnp.zeros_like(query.view.mask).at[56, 56].set(True)
+    again = lambda x: jnp.broadcast_to(x[:1], x.shape)
+    cases = {
+        "as it is": (templates, query),
+        "no mask": (templates, change(lambda q: q.view.mask, query, jnp.zeros_like)),
+        "no patch": (templates, change(lambda q: q.patches.valid, query, jnp.zeros_like)),
+        "one pixel": (templates, change(lambda q: q.view.mask, query, lambda _: one)),
+        "no depth": (templates, change(lambda q: q.view.depth, query, jnp.zeros_like)),
+        "a wall": (templates, change(lambda q: q.view.depth, query, jnp.ones_like)),
+        "no features": (templates, change(lambda q: q.patches.features, query, jnp.zeros_like)),
+        "one template many times": (change(lambda t: t.patches, templates, lambda p: jax.tree.map(again, p)), query),
+        "a surface that is one point": (change(lambda t: t.surface.points, templates, jnp.zeros_like), query),
+    }
+    for name, records in cases.items():
+        for leaf in jax.tree.leaves(slopes(*records, jnp.ones(()))):
+            assert bool(jnp.all(jnp.isfinite(leaf))), name
+    moved = slopes(*cases["as it is"], jnp.ones(()))
+    assert float(jnp.abs(moved[1].view.depth).max()) > 0 and float(jnp.abs(moved[0].surface.points).max()) > 0
+    assert float(jnp.abs(moved[1].patches.features).max()) > 0
 
 
 def test_float32_records_have_the_same_answer_under_x64(templates):
