@@ -71,7 +71,9 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]
     template = jnp.take_along_axis(found.query_to_template[view], order, axis=1)
-    partner = patches.features[view[:, None], template]
+    # The partner of a patch without a match may be no patch and no number, and zero times NaN is a derivative, too.
+    here = patches.valid[view[:, None], template]
+    partner = jnp.where(here[..., None], patches.features[view[:, None], template], 0)
     cosine = _known_cosine(cosine[:, :pairs], query.features[order], partner)
     if chosen is not None:
         ranking = jnp.full(every, jnp.min(ranking) - 1).at[chosen].set(ranking)

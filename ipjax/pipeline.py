@@ -356,7 +356,8 @@ def comparable(templates: Templates, query: Patches, config: Config = Config()) 
     if config.match.centred:
         features = object_features(query.features, templates)
         return eqx.tree_at(lambda q: q.features, query, features), templates
-    raw = templates.patches.features.astype(templates.mean.dtype) * templates.norm[..., None]
+    features = jnp.where(templates.patches.valid[..., None], templates.patches.features, 0)  # others may be no numbers
+    raw = features.astype(templates.mean.dtype) * templates.norm[..., None]
     if templates.basis is not None:
         raw = jnp.matmul(raw, templates.basis, precision="highest")
     raw = raw + templates.mean

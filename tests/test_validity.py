@@ -16,9 +16,12 @@ from test_objects import make_object
 from test_pipeline import DRAWN, make_sized_query, two_objects
 
 import ipjax
+from ipjax.config import MatchConfig
 from ipjax.features import describe
 from ipjax.host.frames import frame
 from ipjax.host.objects import load, save
+from ipjax.matching import match, select
+from ipjax.pipeline import comparable
 from ipjax.validity import finite_patches, finite_query, finite_templates
 
 BAD = (np.nan, np.inf, -np.inf)
@@ -229,6 +232,27 @@ def test_gradients_of_what_is_left_are_finite():
     for slope, value in zip(floats(slopes), floats(poisoned), strict=True):
         assert np.isfinite(np.asarray(slope)).all()
         assert not np.asarray(slope)[~np.isfinite(np.asarray(value))].any()
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_gradients_through_matches_are_those_without_the_poison(centred):
+    """Templates keep the features of patches that are not valid as they are; zero times one of them is no zero."""
+    query, _ = problems.make_query(1)
+    templates = problems.make_templates()
+    settings = dataclasses.replace(DRAWN, match=MatchConfig(views=2, pairs=64, centred=centred))
+    third = np.arange(templates.norm.shape[1]) % 3 == 0
+    put = lambda **fields: dataclasses.replace(templates, patches=dataclasses.replace(templates.patches, **fields))
+
+    def weight(patches, templates):
+        patches, known = comparable(finite_templates(templates)[0], patches, settings)
+        return jnp.sum(select(match(patches, known, settings.match), patches, known, settings.match).weight)
+
+    slopes = jax.jit(jax.grad(weight, argnums=(0, 1), allow_int=True))
+    found = slopes(query.patches, put(features=jnp.where(third[:, None], jnp.nan, templates.patches.features)))
+    wanted = slopes(query.patches, put(valid=templates.patches.valid & ~third))
+    assert np.asarray(wanted[0].features).any()
+    for told in (lambda x: x[0].features, lambda x: x[1].patches.features, lambda x: x[1].norm, lambda x: x[1].mean):
+        np.testing.assert_allclose(told(found), told(wanted), rtol=1e-5, atol=1e-6)
 
 
 def scene() -> dict:
