@@ -14,6 +14,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from ipjax.cameras import crop, resize
 from ipjax.host.storage import parse, read_text
 from ipjax.types import Camera
 
@@ -593,7 +594,7 @@ def _cut_and_binned(camera: Intrinsics, fields: _Fields) -> Intrinsics:
 
     http://docs.ros.org/en/api/sensor_msgs/html/msg/CameraInfo.html
     """
-    matrix, size = camera.matrix.copy(), camera.size
+    matrix, size = camera.matrix, camera.size
     roi = fields.take(re.compile(r"^roi$"))
     if isinstance(roi, dict):
         left, top, width, height = (
@@ -601,21 +602,19 @@ def _cut_and_binned(camera: Intrinsics, fields: _Fields) -> Intrinsics:
             for name in ("x_offset", "y_offset", "width", "height")
         )
         if width > 0 and height > 0:
-            matrix[:2, 2] -= (left, top)
+            matrix = crop(matrix, (left, top))
             size = (int(width), int(height))
         elif left or top:
             raise ValueError("the region of interest has an offset, but no size")
     elif roi is not None and _says_something(roi):
         raise ValueError("roi is not understood; x_offset, y_offset, width and height are expected")
-    for axis, name in enumerate(("binningx", "binningy")):
+    joined = []
+    for name in ("binningx", "binningy"):
         value = fields.take(re.compile(f"^{name}$"))
-        count = 0.0 if value is None else _number(value, "the binning")
-        if count > 1:
-            matrix[axis, axis] /= count
-            matrix[axis, 2] = (matrix[axis, 2] + 0.5) / count - 0.5
-            if size is not None:
-                size = tuple(int(side // count) if i == axis else side for i, side in enumerate(size))
-    return replace(camera, matrix=matrix, size=size)
+        joined.append(max(1.0, 1.0 if value is None else _number(value, "the binning")))  # 0 is said for 1, too
+    if size is not None:
+        size = (int(size[0] // joined[0]), int(size[1] // joined[1]))
+    return replace(camera, matrix=resize(matrix, (joined[0], joined[1]), (1, 1)), size=size)
 
 
 def _number(value: Any, what: str) -> float:

@@ -349,7 +349,7 @@ def draw_attempts(photo: Photo, attempts: list[tuple[str, np.ndarray]], path: st
     height, width = small.shape[:2]
     tiles = [("photo", small)]
     for name, mask in attempts:
-        shape = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+        shape = mostly(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
         tiles.append((name, np.where(shape[..., None], small, small // 4)))
     sheet = []
     for name, tile in tiles:
