@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ipjax
+from benchmarks.bias import pose_errors, summary
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
 from ipjax.features import cut, principal_basis
 from ipjax.pipeline import comparable, distinct
@@ -53,20 +54,49 @@ def same(one, other, tolerance):
     np.testing.assert_allclose(one.scale, other.scale, rtol=tolerance)
 
 
-def assert_near(found, truth, diameters, share):
-    """Its centre within so many diameters, its scale within a share."""
+def assert_near(found, truth, diameters, share, degrees):
+    """Its centre within so many diameters, its scale within a share, its rotation within degrees."""
     assert float(jnp.linalg.norm(found.translation - truth.translation)) < diameters * float(truth.scale)
     assert abs(float(found.scale / truth.scale) - 1) < share
+    assert rotation_error(found, truth) < degrees
+
+
+def gather_errors(found_and_true):
+    """x, y, z and size of each in % of the diameter, and the rotation in degrees."""
+    pairs = list(found_and_true)
+    return np.array([pose_errors(*pair) for pair in pairs]), np.array([rotation_error(*pair) for pair in pairs])
 
 
 @given(st.integers(0, 10_000))
 @settings(max_examples=12)
 def test_recovers_pose_and_size(templates, seed):
-    """Eight directions with no rolls are far apart, so a patch's worth of error is what may remain."""
+    """Eight directions with no rolls are far apart: of sixty poses the worst is off by 7 % of the diameter and 13°."""
     query, truth = problems.make_query(seed)
     found = estimate(templates, query, jax.random.key(0), TINY)
     assert bool(found.success)
-    assert_near(found.camera_from_object, truth, 0.15, 0.2)
+    assert_near(found.camera_from_object, truth, 0.12, 0.15, 20)
+
+
+def test_estimates_are_off_to_no_side(templates):
+    """From the whole image on: signed errors within three standard errors of zero, unsigned ones as small as reached.
+
+    Reached over sixty images: medians of 0.44 % of the diameter, 0.41 % of the size and 1.5°.
+    """
+    encoder, look = problems.make_encoder(), jax.jit(ipjax.observe)
+
+    def answers():
+        for seed in range(40):
+            whole = problems.make_frame(seed)
+            view = ipjax.frame(whole.rgb, whole.depth, whole.mask, whole.matrix, resolution=112)
+            found = estimate(templates, look(encoder, view), jax.random.key(0), TINY)
+            yield found.camera_from_object, whole.camera_from_object
+
+    errors, rotation = gather_errors(answers())
+    mean, error = summary(list(errors))
+    assert (np.abs(mean) <= 3 * error).all(), (mean, error)
+    assert np.median(np.linalg.norm(errors[:, :3], axis=1)) < 0.8
+    assert np.median(np.abs(errors[:, 3])) < 0.8
+    assert np.median(rotation) < 2.5 and np.quantile(rotation, 0.9) < 6
 
 
 def test_a_known_size_is_kept(templates):
@@ -156,10 +186,22 @@ def test_nothing_to_match_is_reported_in_numbers(templates):
 
 
 def test_paper_runs_without_refinement(templates):
-    query, truth = problems.make_query(9)
-    found = estimate(templates, query, jax.random.key(0), Config.paper())
-    assert bool(found.success)
-    assert float(jnp.linalg.norm(found.camera_from_object.translation - truth.translation)) < 0.3 * float(truth.scale)
+    """Pairs of patches alone: medians of 2.7 % of the diameter, 3.1 % of the size and 5.4° over 24 images."""
+
+    def answers():
+        for seed in range(12):
+            query, truth = problems.make_query(seed)
+            found = estimate(templates, query, jax.random.key(0), Config.paper())
+            assert bool(found.success)
+            assert_near(found.camera_from_object, truth, 0.12, 0.15, 18)
+            yield found.camera_from_object, truth
+
+    errors, rotation = gather_errors(answers())
+    mean, error = summary(list(errors))
+    assert (np.abs(mean) <= 3 * error).all(), (mean, error)
+    assert np.median(np.linalg.norm(errors[:, :3], axis=1)) < 4.5
+    assert np.median(np.abs(errors[:, 3])) < 5
+    assert np.median(rotation) < 8
 
 
 @pytest.mark.parametrize(
@@ -338,11 +380,22 @@ def test_fewer_channels_still_recover_pose_and_size(templates):
     """Sixteen of thirty-two: the answer is nearly the same, and features of either length are told apart."""
     short = shorten(templates, 16)
     assert short.patches.features.shape[-1] == 16
-    for seed in range(3):
-        query, truth = problems.make_query(seed)
-        found = estimate(short, query, jax.random.key(0), TINY)
-        assert bool(found.success)
-        assert_near(found.camera_from_object, truth, 0.15, 0.15)
+
+    def answers():
+        for seed in range(12):
+            query, truth = problems.make_query(seed)
+            found = estimate(short, query, jax.random.key(0), TINY)
+            assert bool(found.success)
+            assert_near(found.camera_from_object, truth, 0.12, 0.15, 15)
+            yield found.camera_from_object, truth
+
+    # Over 24 images: medians of 0.68 % of the diameter, 0.52 % of the size and 2.6°.
+    errors, rotation = gather_errors(answers())
+    mean, error = summary(list(errors))
+    assert (np.abs(mean) <= 3 * error).all(), (mean, error)
+    assert np.median(np.linalg.norm(errors[:, :3], axis=1)) < 1.4
+    assert np.median(np.abs(errors[:, 3])) < 1.2
+    assert np.median(rotation) < 4.5
     with pytest.raises(ValueError, match="16 channels"):
         query, _ = problems.make_query(0, channels=16)
         ipjax.estimate(None, short, query, jax.random.key(0), TINY)
