@@ -59,6 +59,8 @@ def estimate(
     _check_encoders(encoder, templates, query)
     (templates, known), (query, there) = finite_templates(templates), finite_query(query)
     meant = known & there & _are_numbers(config)
+    # In the records' precision: under x64 numbers from elsewhere have another, and the pose would get it.
+    config, diameter = jax.tree.map(lambda x: jnp.asarray(x, query.patches.points.dtype), (config, diameter))
     if diameter is not None:
         sized = jnp.isfinite(diameter) & (diameter > 0)
         meant, diameter = meant & sized, jnp.where(sized, diameter, 1)

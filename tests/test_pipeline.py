@@ -175,6 +175,20 @@ def test_scaling_the_object_scales_nothing_but_the_scale(templates):
     np.testing.assert_allclose(small.translation, full.translation, atol=1e-3)
 
 
+@pytest.mark.parametrize("config", [TURNED, DRAWN, Config.paper()])
+def test_the_answer_has_the_precision_of_the_records(config, x64):
+    """Whatever that of the thresholds and the diameter is: under x64 both are float64 if nobody says otherwise."""
+    known = two_objects()[0]
+    query, truth = problems.make_query(0)
+    run = lambda config, diameter: ipjax.estimate(
+        problems.make_encoder(), known, query, jax.random.key(0), config, diameter
+    )
+    wide = jax.tree.map(jnp.float64, (config, truth.scale))
+    one, other = (jax.eval_shape(run, *given) for given in ((config, truth.scale), wide))
+    assert jax.tree.map(lambda x: x.dtype, one) == jax.tree.map(lambda x: x.dtype, other)
+    assert one.camera_from_object.scale.dtype == one.confidence.dtype == jnp.float32
+
+
 def test_nothing_to_match_is_reported_in_numbers(templates):
     query, _ = problems.make_query(0)
     nothing = jnp.zeros_like(query.patches.valid)
