@@ -141,7 +141,9 @@ def test_large_meshes_are_simplified_within_a_percent(tmp_path):
 
 
 def test_the_encoder_must_be_the_one_that_made_it(file):
-    load(file, SimpleNamespace(identity="dinov2 vits14 block=8"))
+    for alike_or_nameless in ("dinov2 vits14 block=8", "unnamed", ""):
+        load(file, SimpleNamespace(identity=alike_or_nameless))
+    load(file, lambda image: image)  # as everywhere, what has no identity is not compared
     with pytest.raises(ValueError, match="onboard the object again") as caught:
         load(file, SimpleNamespace(identity="dinov2 vitb14 block=8"))
     assert "vits14" in str(caught.value) and "vitb14" in str(caught.value)

@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ipjax.features import identity_of
 from ipjax.host.storage import check_budget, parse_json, read_safetensors_header, writing
 from ipjax.types import UNNAMED, Appearance, Camera, Patches, Similarity, Surface, Templates
 
@@ -401,16 +402,17 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
     """Read an object file.
 
     Args:
-        encoder: the encoder that will describe queries; anything with an ``identity``. None = do not compare.
+        encoder: the encoder that will describe queries. None, or one without an ``identity``, is not compared.
 
     Raises:
         ValueError: missing, damaged, of another version, or made by another encoder; one sentence that names the file.
     """
     header, tensors = _read(Path(path))
     info = _info(header, tensors, Path(path))
-    if encoder is not None and encoder.identity != info.encoder:
+    made_by, given = None if info.encoder in ("", UNNAMED) else info.encoder, identity_of(encoder)
+    if made_by and given and made_by != given:
         raise ValueError(
-            f"{path}: made with the encoder '{info.encoder}', but the one at hand is '{encoder.identity}'; "
+            f"{path}: made with the encoder '{made_by}', but the one at hand is '{given}'; "
             "onboard the object again, or give the weights it was made with"
         )
     device = {name: jnp.asarray(tensors[name]) for name in _TEMPLATE_TENSORS}
@@ -422,7 +424,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
                 points=device["points"],
                 grid=device["grid"],
                 valid=jnp.asarray(tensors["valid"] & _is_finite(tensors)),
-                encoder=None if info.encoder in ("", UNNAMED) else info.encoder,
+                encoder=made_by,
             ),
             mean=device["mean"],
             norm=device["norm"],
