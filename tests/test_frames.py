@@ -259,6 +259,11 @@ def refusals():
     yield "crop must be", (rgb, depth, mask, K), {"crop": "round"}
     yield "background must be", (rgb, depth, mask, K), {"background": "pink"}
     yield "resolution", (rgb, depth, mask, K), {"resolution": 3}
+    for name in ("pad", "edge_tolerance"):
+        for value in (-1.5, np.nan, np.inf):
+            yield f"{name} must be a finite number from 0 on", (rgb, depth, mask, K), {name: value}
+    for value in (-1, 1.5):
+        yield "erosion must be a whole number of pixels", (rgb, depth, mask, K), {"erosion": value}
 
 
 @pytest.mark.parametrize(("words", "positional", "named"), list(refusals()))

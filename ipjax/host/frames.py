@@ -117,6 +117,11 @@ def frame_turned(
         raise ValueError(f"background must be 'black', 'grey' or 'keep', not {background!r}")
     if not (isinstance(resolution, int | np.integer) and 14 <= resolution <= 4096):
         raise ValueError(f"the resolution must be a whole number of pixels from 14 to 4096, not {resolution!r}")
+    if not (isinstance(erosion, int | np.integer) and erosion >= 0):
+        raise ValueError(f"erosion must be a whole number of pixels from 0 on, not {erosion!r}")
+    for name, value in (("pad", pad), ("edge_tolerance", edge_tolerance)):
+        if not (np.ndim(value) == 0 and np.isfinite(value) and value >= 0):
+            raise ValueError(f"{name} must be a finite number from 0 on, not {value!r}")
     intrinsics = as_intrinsics(camera)
     rgb = _check_rgb(rgb)
     height, width = rgb.shape[:2]
