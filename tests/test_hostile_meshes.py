@@ -188,6 +188,7 @@ FILES = {
     ),
     "far_index.obj": (lambda: b"v 0 0 0\nf 1 2 99999999999999999999999", "whole numbers|names"),
     "count.stl": (lambda: bytes(80) + struct.pack("<I", 2**31) + bytes(50), "promises"),
+    "digits.stl": (lambda: b"solid a\nfacet\n" + b"vertex " + b"1" * 20_000_000, "three a face"),
     "text.stl": (lambda: b"solid a\nfacet\n" + b"vertex 1 2 3\n" * 400_001, "three a face"),
 }  # fmt: skip
 

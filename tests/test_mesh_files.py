@@ -458,6 +458,16 @@ def test_images_are_found_behind_options_and_habits(tmp_path, line):
     check_box(load_mesh(write_obj(tmp_path / "box.obj", head="mtllib Box.MTL\nusemtl m")))
 
 
+def test_a_file_that_lacks_much_says_so_in_a_few_sentences(tmp_path):
+    names = range(300)
+    (tmp_path / "box.mtl").write_text("".join(f"newmtl m{i}\nmap_Kd gone{i}.png\n" for i in names))
+    faces = [line for i in names for line in (f"usemtl m{i}", "f 1/1 2/2 3/3")]
+    with pytest.warns(UserWarning) as caught:
+        mesh = load_mesh(write_obj(tmp_path / "box.obj", head="mtllib box.mtl", faces=faces))
+    said = [str(warning.message) for warning in caught]
+    assert 2 <= len(said) <= 10 and "gone0.png" in said[0] and "more" in said[-1] and len(mesh.notes) < 16
+
+
 def test_options_move_the_image(tmp_path):
     (tmp_path / "skin.png").write_bytes(encode())
     (tmp_path / "box.mtl").write_text("newmtl m\nmap_Kd -o 0.25 -0.5 -s 2 4 skin.png\n")

@@ -34,6 +34,7 @@ MAX_FACES = 3_000_000
 MAX_BYTES = 2_000_000_000  # of a file
 GROWTH = 24  # bytes that a large file may take in memory for each of its own, past the budget of any file
 VERTEX_BYTES, FACE_BYTES = 240, 150  # of memory while a mesh is made
+MAX_WARNINGS = 8  # of one file
 GREY = 160
 IMAGES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tga", ".tif", ".tiff")
 LFS = b"version https://git-lfs"
@@ -90,9 +91,11 @@ class Source:
         self.take(vertices * VERTEX_BYTES + faces * FACE_BYTES, f"{vertices:,} vertices and {faces:,} faces")
 
     def warn(self, sentence: str) -> None:
-        """Something of the file is not read; said once."""
-        if sentence not in self.warnings:
-            self.warnings.append(sentence)
+        """Something of the file is not read; said once, and of a file where much is missing the first few."""
+        if sentence in self.warnings or len(self.warnings) > MAX_WARNINGS:
+            return
+        more = "there is more that is not read"
+        self.warnings.append(sentence if len(self.warnings) < MAX_WARNINGS else more)
 
     # Files beside it.
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from ipjax.host.parts import MARK, Part, Source
 
-NUMBER = rb"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:e[+-]?[0-9]+)?|[+-]?nan|[+-]?inf"
+# Digits are bounded: without, a file of nothing but digits takes the square of its length to be refused.
+NUMBER = rb"[+-]?(?:[0-9]{1,64}(?:\.[0-9]{0,64})?|\.[0-9]{1,64})(?:e[+-]?[0-9]{1,8})?|[+-]?nan|[+-]?inf"
 VERTEX = re.compile(rb"\bvertex\s+(%s)\s+(%s)\s+(%s)" % (NUMBER, NUMBER, NUMBER), re.IGNORECASE)
 RECORD = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
