@@ -255,6 +255,16 @@ def test_a_flat_object_before_a_number_for_unknown_is_kept(behind):
     assert (kept[DISC] == 300).all() and not kept[~DISC].any() and said.count("%") == 1
 
 
+def test_where_nothing_was_measured_there_is_no_depth():
+    for depth in (np.full(DEPTH.shape, 65535, np.uint16), np.where(DISC, 65535, 0).astype(np.uint16)):
+        with pytest.raises(ValueError, match="there is no depth inside the mask"):
+            frame(RGB, depth, DISC, K, depth_scale=1e-3)
+    hidden = np.random.default_rng(0).uniform(size=DEPTH.shape) < 0.3
+    expected = frame(RGB, np.where(hidden, 0, DEPTH), DISC, K, resolution=56)
+    view = frame(RGB, np.ma.masked_array(np.where(hidden, 0.3, DEPTH), hidden), DISC, K, resolution=56)
+    np.testing.assert_array_equal(view.depth, expected.depth)
+
+
 def test_depth_that_only_looks_alike_is_kept():
     wall = DEPTH.copy()
     wall[:, 64:] = 1.3  # a wall seen straight on, behind everything

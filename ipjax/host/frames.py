@@ -125,7 +125,7 @@ def frame_turned(
     intrinsics = as_intrinsics(camera)
     rgb = _check_rgb(rgb)
     height, width = rgb.shape[:2]
-    depth = as_native(np.asarray(depth))
+    depth = as_native(np.asarray(np.ma.filled(depth, 0)))  # what a masked array masks is unknown
     depth = depth[..., 0] if depth.ndim == 3 and depth.shape[-1] == 1 else depth
     if depth.shape != (height, width):
         raise ValueError(

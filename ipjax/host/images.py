@@ -276,13 +276,14 @@ def forget_sentinel(depth: np.ndarray) -> tuple[np.ndarray, str]:
         extreme = others(values)
         same = values == extreme
         rest = values[~same]
-        if rest.size == 0:
-            break
-        is_largest = others is np.max and float(extreme) in _LARGEST
-        beyond = extreme >= 1.5 * others(rest) if others is np.max else extreme <= 0.2 * others(rest)
-        if is_largest or (same.sum() >= 0.05 * depth.size and beyond):
+        strange = others is np.max and float(extreme) in _LARGEST
+        if not strange and rest.size and same.sum() >= 0.05 * depth.size:
+            strange = extreme >= 1.5 * others(rest) if others is np.max else extreme <= 0.2 * others(rest)
+        if strange:
             found.append(extreme)
             values = rest
+        if values.size == 0:
+            break
     if not found:
         return depth, ""
     depth = depth.copy()
