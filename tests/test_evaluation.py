@@ -197,6 +197,15 @@ def test_sizes_are_kept_beside_the_bop_file_and_found_there(small, tmp_path):
     others.rename(beside)
     found = run(path)
     assert found.all_frames.sized == {} and any("so that sizes are left out" in note for note in found.notes)
+    whole = beside.read_text()
+    for damaged in ("", whole.replace(",1.03", ",-1.03"), whole.replace("time,scale", "time,size")):
+        beside.write_text(damaged)
+        found = run(path)
+        assert found.all_frames.sized == {} and not found.problems
+        assert any(str(beside) in note and "so that sizes are left out" in note for note in found.notes)
+        with pytest.raises(DatasetError, match=r"mine_small-test\.sized, line"):
+            run(path, sizes=beside)
+    beside.write_text(whole)
     for scale in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="its scale is"):
             bop.write_results(tmp_path / "bad.csv", rows, scales=[scale] * len(rows))
@@ -693,6 +702,16 @@ def opposite(row):
     return replace(row, rotation=tuple(rotation.ravel()), translation=tuple(flip @ row.translation))
 
 
+def transposed(row):
+    return replace(row, rotation=tuple(np.reshape(row.rotation, (3, 3)).T.ravel()))
+
+
+def inverted(row):
+    """The camera's pose in the object's frame."""
+    R = np.reshape(row.rotation, (3, 3)).T
+    return replace(transposed(row), translation=tuple(-R @ row.translation))
+
+
 def strayed(row):
     return replace(row, obj_id=1)
 
@@ -701,7 +720,8 @@ def strayed(row):
     ("change", "says"),
     [
         (moved(1e-3), "1000 times too small .* must be in millimetres; it seems to be in metres"),
-        (moved(0.1), "10 times too small .* must be in millimetres"),
+        (moved(0.1), "10 times too small .* must be in millimetres; it seems to be in centimetres"),
+        (moved(1 / 25.4), "25.4 times too small .* must be in millimetres; it seems to be in inches"),
         (moved(1e3), "1000 times too large .* must be in millimetres"),
         (opposite, "behind the camera .*: poses must be in OpenCV axes"),
         (strayed, "none of the 4 estimates is of a target"),
@@ -714,6 +734,27 @@ def test_the_command_says_what_is_wrong_with_all_of_a_file(scored, change, says)
     assert re.search(says, error), error
     status, out, _ = scored(lambda *_: None, "--skip-bad")
     assert status == 0 and re.search(f"Note: .*{says}", out)
+
+
+@pytest.mark.parametrize("change", [transposed, inverted])
+def test_poses_the_wrong_way_round_are_told(small, change):
+    rows = [change(row) for row in true_rows(small)]
+    says = "right when R is transposed: R and t must map the model into the camera's frame"
+    with pytest.raises(DatasetError, match=f"results: the rotations are {says}"):
+        evaluation.score(rows, small, ("mssd",), samples=0)
+    assert says in evaluation.score(rows, small, ("mssd",), samples=0, on_error="skip").table()
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=10)
+def test_rotations_that_are_merely_wrong_are_scored(small, seed):
+    random = np.random.default_rng(seed)
+    turns = [np.linalg.qr(random.normal(size=(3, 3)))[0] for _ in true_rows(small)]
+    rows = [
+        replace(row, rotation=tuple((turn * np.linalg.det(turn)).ravel()))
+        for row, turn in zip(true_rows(small), turns, strict=True)
+    ]
+    evaluation.score(rows, small, ("mssd",), samples=0)
 
 
 @pytest.mark.parametrize("change", [moved(1.6), moved(0.6), moved((1, 1, -0.1)), moved((-5, -5, 1))])
@@ -733,6 +774,11 @@ def test_rotations_that_are_rounded_are_accepted(seed, noise):
     for bad in (1.02 * turn, 0.98 * turn, -turn, turn @ np.diag([1, 1.02, 1]), 0 * turn):
         with pytest.raises(ValueError, match="R is no rotation"):
             bop.check_rotation(bad.ravel())
+
+
+def test_a_file_without_estimates_is_told(small):
+    found = evaluation.score([], small, ("mssd",), samples=0)
+    assert found.all_frames.recalls["mssd"] == 0 and "every target is a miss" in found.table()
 
 
 def test_estimates_of_no_target_are_counted(small):

@@ -634,7 +634,13 @@ class _Job:
         path = sized_path(results) if beside else Path(sizes)
         if beside and (not path.is_file() or all(row.scale is not None for row in rows)):
             return rows
-        kept = {_identity(row): row.scale for row in read_results(path, problems=self.problems if beside else None)}
+        try:
+            kept = {_identity(row): row.scale for row in read_results(path)}
+        except DatasetError as error:
+            if not beside:
+                raise
+            self.notes.append(f"{error}, so that sizes are left out")
+            return rows
         for row in rows:
             if kept.get(_identity(row)) is None:
                 message = f"{path}: it holds no size for line {row.line} of {results.name}"
@@ -650,11 +656,17 @@ class _Job:
         strays = sum((row.scene_id, row.im_id, row.obj_id) not in targets for row in rows)
         message = _suspect_conventions(
             [
-                (np.asarray(row.translation) * MM, np.median([t.translation for t in slot.truths], axis=0))
+                (
+                    _pose(row),
+                    [Pose(t.rotation, t.translation) for t in slot.truths],
+                    self.infos[slot.row.obj_id].symmetry_rotations,
+                )
                 for slot in slots
                 for row in slot.estimates
             ]
         )
+        if not rows:
+            self.notes.append("there are no estimates, so that every target is a miss")
         if strays and strays == len(rows) and "ap" not in self.metrics:
             message = f"none of the {strays} estimates is of a target of {self.dataset.targets_file}"
         elif strays and "ap" not in self.metrics:
@@ -1421,29 +1433,50 @@ def _identity(row: ResultRow) -> tuple:
     return row.scene_id, row.im_id, row.obj_id, row.score, row.rotation, row.translation
 
 
-def _suspect_conventions(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> str | None:
-    """What is wrong with all of a file's translations, given each with that of the annotation (metres): in words, or
-    None. Only what no method that merely fails can do: three quarters of them off by the same power of ten, or behind
-    the camera at the right distance."""
+# What a file's translations are multiplied by when they are in another unit; other powers of ten have no name here.
+_UNITS = {10.0**k: "" for k in range(-9, 10)} | {1e-3: "metres", 1e-1: "centimetres", 1 / 25.4: "inches"}
+_MOST_TURNS = 60  # rotations that leave an icosahedron as it is; no other solid with finitely many has more
+_ALIKE = 1 + 2 * math.cos(math.radians(15))  # the trace of a turn by 15°
+
+
+def _suspect_conventions(pairs: Sequence[tuple[Pose, Sequence[Pose], np.ndarray]]) -> str | None:
+    """What is wrong with all of a file's poses, given each with those of the annotation and with the rotations of the
+    object's symmetries: in words, or None. Only what no method that merely fails can do: three quarters of the lengths
+    off by the factor of another unit; half of the rotations right when transposed, and hardly any as they are; three
+    quarters of the objects behind the camera, at the right distance."""
     if not pairs:
         return None
-    estimates, truths = np.stack([e for e, _ in pairs]), np.stack([t for _, t in pairs])
-    ratio = np.linalg.norm(estimates, axis=-1) / np.maximum(np.linalg.norm(truths, axis=-1), 1e-9)
-    middle = float(np.median(ratio))
-    power = round(math.log10(middle)) if middle > 0 else 0
-    alike = np.mean(np.abs(np.log(np.maximum(ratio, 1e-12) / 10.0**power)) < math.log(1.25)) > 0.75
-    if abs(power) >= 2 or (power and len(pairs) >= 3):
-        if alike:
-            factor = f"{10 ** abs(power)} times too {'small' if power < 0 else 'large'}"
-            lengths = [f"{np.median(np.linalg.norm(x, axis=-1)) / MM:.4g}" for x in (estimates, truths)]
-            unit = "; it seems to be in metres" if power == -3 else ""
-            return (
-                f"the translations are some {factor} (median length {lengths[0]}, annotated {lengths[1]} mm): t must "
-                f"be in millimetres{unit}"
-            )
-    elif len(pairs) >= 3 and alike and np.mean((estimates[:, 2] < 0) & (truths[:, 2] > 0)) > 0.75:
+    estimates = np.stack([estimate.translation for estimate, _, _ in pairs])
+    truths = np.stack([np.median([truth.translation for truth in told], axis=0) for _, told, _ in pairs])
+    lengths = np.linalg.norm(estimates, axis=-1), np.linalg.norm(truths, axis=-1)
+    ratio = np.maximum(lengths[0] / np.maximum(lengths[1], 1e-9), 1e-12)
+    factor = min(_UNITS, key=lambda factor: abs(math.log(np.median(ratio) / factor)))
+    alike = np.mean(np.abs(np.log(ratio / factor)) < math.log(1.25)) > 0.75
+    few = len(pairs) < 3
+    if alike and factor != 1 and not (few and 0.01 < factor < 100):
+        off = f"{1 / factor:g} times too small" if factor < 1 else f"{factor:g} times too large"
+        unit = f"; it seems to be in {_UNITS[factor]}" if _UNITS[factor] else ""
+        told = [f"{np.median(length) / MM:.4g}" for length in lengths]
+        return (
+            f"the translations are some {off} (median length {told[0]}, annotated {told[1]} mm): t must be in "
+            f"millimetres{unit}"
+        )
+    if few:
+        return None
+    # The axis of a body of revolution may be right either way.
+    turned = [pair for pair in pairs if len(pair[2]) <= _MOST_TURNS]
+    right = [_is_turned_like(estimate.rotation, *rest) for estimate, *rest in turned]
+    other = [_is_turned_like(estimate.rotation.T, *rest) for estimate, *rest in turned]
+    if len(turned) >= 3 and np.mean(right) < 0.25 and np.mean(other) >= 0.5:
+        return "the rotations are right when R is transposed: R and t must map the model into the camera's frame"
+    if factor == 1 and alike and np.mean((estimates[:, 2] < 0) & (truths[:, 2] > 0)) > 0.75:
         return "the objects are behind the camera (z below 0): poses must be in OpenCV axes, x right, y down, z ahead"
     return None
+
+
+def _is_turned_like(rotation: np.ndarray, truths: Sequence[Pose], symmetries: np.ndarray) -> bool:
+    """Whether a rotation is within 15° of one of the true ones, up to the object's symmetries."""
+    return any((rotation * (truth.rotation @ symmetries)).sum((-2, -1)).max() > _ALIKE for truth in truths)
 
 
 def _symmetric(
