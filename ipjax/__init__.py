@@ -85,7 +85,7 @@ _HOME = {name: f"ipjax.{module}" for module, names in _HOMES.items() for name in
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
-    if not name.startswith("_") and importlib.util.find_spec(f"ipjax.{name}") is not None:
+    if name.isidentifier() and not name.startswith("_") and importlib.util.find_spec(f"ipjax.{name}") is not None:
         return importlib.import_module(f"ipjax.{name}")
     raise AttributeError(f"module 'ipjax' has no attribute {name!r}")
 

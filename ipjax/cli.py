@@ -117,6 +117,9 @@ class _Notes(logging.Handler):
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
+        option = re.fullmatch(r"argument (?:-\w/)?(--[\w-]+): expected one argument", message)
+        if option is not None:  # argparse takes what begins with a minus for another option
+            message += f"; one that begins with a minus is written {option[1]}=-1"
         self.exit(2, f"{self.prog}: {' '.join(message.split())} (see {self.prog} --help)\n")
 
 
@@ -869,11 +872,18 @@ examples:
         "--sizes",
         type=Path,
         metavar="CSV",
-        help="the same with a column scale (default: CSV's .sized, if it is there)",
+        help="its rows with a column scale, estimated over true size (default: CSV's .sized, if it is there)",
     )
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument("--split", default="test", help="which split (default test)")
-    parser.add_argument("--metrics", nargs="+", choices=_METRICS, default=("mssd", "mspd", "vsd"))
+    parser.add_argument(
+        "--metrics",
+        nargs="+",
+        choices=_METRICS,
+        metavar="METRIC",
+        default=_METRICS[:3],
+        help=f"of {', '.join(_METRICS)} (default: the first three)",
+    )
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
     parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the score as JSON")
@@ -948,11 +958,18 @@ state of the code, are not continued; --restart begins anew.
     )
     parser.add_argument("--known-size", action="store_true", help="tell the method each object's true diameter")
     parser.add_argument("--crop", choices=("square", "look_at"), default="square", help="how the query is cut out")
-    parser.add_argument("--metrics", nargs="+", choices=_METRICS, default=("mssd", "mspd", "vsd", "add", "add_s"))
+    parser.add_argument(
+        "--metrics",
+        nargs="+",
+        choices=_METRICS,
+        metavar="METRIC",
+        default=_METRICS[:5],
+        help=f"of {', '.join(_METRICS)} (default: all but the last)",
+    )
     parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
     parser.add_argument("--directions", type=_positive, metavar="N", help="viewpoints of new object files (default 40)")
     parser.add_argument("--rolls", type=_positive, metavar="N", help="in-plane rotations of each (default 10)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="same seed, same answer (default 0)")
     parser.add_argument("--without", nargs="+", metavar="SCENE/IMAGE", help="also score without these images")
     parser.add_argument("--restart", action="store_true", help="forget what is in the folder of results")
     parser.add_argument("--skip-bad", action="store_true", help="count damaged images as misses, instead of stopping")
@@ -1027,10 +1044,10 @@ examples:
   ipjax degrade mug.glb -o worse.glb --level 2 --alignment worse.json
 """,
     )
-    parser.add_argument("mesh", metavar="MESH", type=Path)
-    parser.add_argument("-o", "--output", metavar="GLB", type=Path, required=True)
+    parser.add_argument("mesh", metavar="MESH", type=Path, help="OBJ, PLY, GLB, glTF or STL")
+    parser.add_argument("-o", "--output", metavar="GLB", type=Path, required=True, help="the worse mesh to write")
     parser.add_argument("--level", type=int, default=2, choices=(1, 2, 3, 4), help="4 is worst (default 2)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of what is random about it (default 0)")
     parser.add_argument("--alignment", type=Path, metavar="JSON", help="where the map back goes; for evaluation only")
 
 
@@ -1073,8 +1090,10 @@ examples:
     parser.add_argument(
         "object", metavar="OBJ", type=Path, help="an object file: its shapes are exported, not its content"
     )
-    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True)
-    parser.add_argument("--batch", type=_positive, help="queries at once (default: one, without a batch axis)")
+    parser.add_argument("-o", "--output", metavar="FILE", type=Path, required=True, help="FILE.stablehlo")
+    parser.add_argument(
+        "--batch", metavar="N", type=_positive, help="queries at once (default: one, without a batch axis)"
+    )
     _add_config(parser)
 
 

@@ -233,6 +233,7 @@ def test_help_and_version_load_nothing_but_the_command(words):
     ("words", "said"),
     [
         (["estimate", "a.ipjax", "--box", "210", "130", "90", "120"], "with commas and no spaces, X,Y,W,H"),
+        (["estimate", "a.ipjax", "--box", "-1,2,3,4"], "begins with a minus is written --box=-1"),
         (["estimate", "a.ipjax", "--box", "210,130,90"], "is no box"),
         (["onboard", "a.png", "-o", "a.ipjax", "--box", "1,2,3,nan"], "is no box"),
         (["estimate", "a.ipjax", "--method", "best"], "--method is called --config now: default"),
