@@ -242,11 +242,12 @@ def _search(rigid, strains, start, surface, cloud, pairs, config, unit):
         # What the solver differentiates is linear; the added zero has the slopes.
         return value + jnp.sum(slopes * (step - here), axis=1)
 
-    before = _mean_square(_linearise(start, zero, *given, rigid=rigid)[0], strains)
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
     solver = eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
     solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
-    after = _mean_square(solution.state.f_info.residual, strains)
+    residuals = solution.state.f_info.residual
+    before = 2 * solution.state.search_state.first / (residuals.shape[0] - strains)
+    after = _mean_square(residuals, strains)
     better = after < before  # false where it is not finite
     step = jnp.where(better, solution.value, 0)
     return retract(start, step[:rigid]), step[rigid:], jnp.where(better, after, before), before
@@ -283,11 +284,23 @@ def _mean_square(values, strains):  # the prior adds to it but is no residual of
     return jnp.sum(values**2) / (values.shape[0] - strains)
 
 
+class _Searched(eqx.Module):
+    """The state of a search, and the function's value where it began, which need not be computed once more."""
+
+    inner: Any
+    first: Float[Array, ""]
+
+
 class _TrustRegion(optx.ClassicalTrustRegion):
-    """Optimistix's, in the precision of the residuals; its own is the default precision."""
+    """Optimistix's, in the precision of the residuals (its own is the default precision); remembers the first value."""
 
     def init(self, y, f_info_struct):
-        return jax.tree.map(lambda x: x.astype(y.dtype), super().init(y, f_info_struct))
+        inner = jax.tree.map(lambda x: x.astype(y.dtype), super().init(y, f_info_struct))
+        return _Searched(inner, jnp.zeros((), y.dtype))
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        *found, inner = super().step(first_step, y, y_eval, f_info, f_eval_info, state.inner)
+        return *found, _Searched(inner, jnp.where(first_step, f_eval_info.as_min(), state.first))
 
 
 @functools.partial(jax.jit, static_argnames="rigid")  # so that it is traced once
