@@ -1456,17 +1456,17 @@ def _suspect_conventions(pairs: Sequence[tuple[Pose, Sequence[Pose], np.ndarray]
     if alike and factor != 1 and not (few and 0.01 < factor < 100):
         off = f"{1 / factor:g} times too small" if factor < 1 else f"{factor:g} times too large"
         unit = f"; it seems to be in {_UNITS[factor]}" if _UNITS[factor] else ""
-        told = [f"{np.median(length) / MM:.4g}" for length in lengths]
+        middle = [f"{np.median(length) / MM:.4g}" for length in lengths]
         return (
-            f"the translations are some {off} (median length {told[0]}, annotated {told[1]} mm): t must be in "
+            f"the translations are some {off} (median length {middle[0]}, annotated {middle[1]} mm): t must be in "
             f"millimetres{unit}"
         )
     if few:
         return None
     # The axis of a body of revolution may be right either way.
     turned = [pair for pair in pairs if len(pair[2]) <= _MOST_TURNS]
-    right = [_is_turned_like(estimate.rotation, *rest) for estimate, *rest in turned]
-    other = [_is_turned_like(estimate.rotation.T, *rest) for estimate, *rest in turned]
+    right = [_is_turned_like(estimate.rotation, told, same) for estimate, told, same in turned]
+    other = [_is_turned_like(estimate.rotation.T, told, same) for estimate, told, same in turned]
     if len(turned) >= 3 and np.mean(right) < 0.25 and np.mean(other) >= 0.5:
         return "the rotations are right when R is transposed: R and t must map the model into the camera's frame"
     if factor == 1 and alike and np.mean((estimates[:, 2] < 0) & (truths[:, 2] > 0)) > 0.75:
