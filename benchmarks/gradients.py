@@ -16,7 +16,6 @@ import numpy as np
 
 import ipjax
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
-from ipjax.metrics import turn_angle
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
 import problems
@@ -58,15 +57,23 @@ def change(name, amount, templates, query):
 CHANGES = {"depth": 0.01, "depth, waves": 0.01, "features": 0.02, "surface, size": 0.02, "surface, waves": 0.01}
 
 
-def tell(name, amount, templates, query, start):
-    """Where the estimate is after a change, relative to ``start``: diameters, logarithm, rad; and its confidence."""
-    found = ipjax.estimate(None, *change(name, amount, templates, query), jax.random.key(0), CONFIG)
+def tell(amounts, templates, query, start):
+    """Where the estimate is after changes, relative to ``start``: diameters, logarithm, rad; and its confidence."""
+    for name, amount in zip(CHANGES, amounts, strict=True):
+        templates, query = change(name, amount, templates, query)
+    found = ipjax.estimate(None, templates, query, jax.random.key(0), CONFIG)
     pose = found.camera_from_object
     shift = (pose.translation - start.translation) / start.scale
     turn = pose.rotation @ start.rotation.T
     vector = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
     size = jnp.log(pose.scale / start.scale)
-    return jnp.concatenate([shift, size[None], vector, found.confidence[None]]), turn_angle(jnp.trace(turn))
+    return jnp.concatenate([shift, size[None], vector, found.confidence[None]]), pose
+
+
+@jax.jit
+def differentiate(amounts, direction, templates, query, start):
+    """What :func:`tell` says, its derivative, and the pose itself."""
+    return jax.jvp(lambda amounts: tell(amounts, templates, query, start), (amounts,), (direction,), has_aux=True)
 
 
 def rows(seed: int, count: int):
@@ -74,18 +81,18 @@ def rows(seed: int, count: int):
     templates, (query, truth) = problems.make_templates(), problems.make_query(seed, noise=0.3)
     dense = eqx.tree_at(lambda t: t.surface, templates, problems.make_surface(2048))
     templates, query, truth = widen((dense, query, truth))
-    start = jax.jit(ipjax.estimate)(None, templates, query, jax.random.key(0), CONFIG).camera_from_object
-    for name, reach in CHANGES.items():
+    nothing = jnp.zeros(len(CHANGES))
+    start = differentiate(nothing, nothing, templates, query, truth)[2]
+    for index, (name, reach) in enumerate(CHANGES.items()):
         unit = float(truth.scale) if name.startswith("depth") else 1.0
-        told = lambda amount, name=name: tell(name, amount, templates, query, start)[0]
-        both = jax.jit(lambda amount, told=told: jax.jvp(told, (amount,), (jnp.ones_like(amount),)))
-        amounts = np.linspace(-reach, reach, count) * unit
-        derivative = np.asarray(both(jnp.zeros(()))[1]) * unit
-        values = np.stack([np.asarray(both(jnp.asarray(amount))[0]) for amount in amounts])
-        basis = np.stack([np.ones(count), amounts / unit, (amounts / unit) ** 2], axis=1)
+        direction = jnp.zeros(len(CHANGES)).at[index].set(unit)
+        steps = np.linspace(-reach, reach, count)
+        derivative = np.asarray(differentiate(0 * direction, direction, templates, query, start)[1])
+        values = np.stack([differentiate(step * direction, direction, templates, query, start)[0] for step in steps])
+        basis = np.stack([np.ones(count), steps, steps**2], axis=1)
         fitted, *_ = np.linalg.lstsq(basis, values, rcond=None)
         variance = np.sum((values - basis @ fitted) ** 2, axis=0) / (count - 3)
-        yield name, derivative, fitted[1], np.sqrt(variance / np.sum((amounts / unit) ** 2))
+        yield name, derivative, fitted[1], np.sqrt(variance / np.sum(steps**2))
 
 
 def main():
