@@ -62,6 +62,7 @@ def estimate(
     # In the records' precision: under x64 numbers from elsewhere have another, and the pose would get it.
     config, diameter = jax.tree.map(lambda x: jnp.asarray(x, query.patches.points.dtype), (config, diameter))
     if diameter is not None:
+        diameter = jnp.asarray(diameter, query.view.depth.dtype)  # numbers of one's own are wider under x64
         sized = jnp.isfinite(diameter) & (diameter > 0)
         meant, diameter = meant & sized, jnp.where(sized, diameter, 1)
     with jax.named_scope("match"):
