@@ -54,8 +54,11 @@ def test_quickstart_runs(tmp_path, monkeypatch):
     assert bool(found.success)
     true = scene.camera_from_object[0]
     offset = np.asarray(found.camera_from_object.translation) - np.asarray(true.translation)
-    assert np.linalg.norm(offset) < 0.25 * float(true.scale)
-    assert abs(float(found.camera_from_object.scale) / float(true.scale) - 1) < 0.25
+    # One scene with one seed comes out 0.9 % of the diameter and 0.6° off, and 0.2 % too small.
+    assert np.linalg.norm(offset) < 0.03 * float(true.scale)
+    assert abs(float(found.camera_from_object.scale) / float(true.scale) - 1) < 0.02
+    turn = np.asarray(true.rotation, np.float64).T @ np.asarray(found.camera_from_object.rotation, np.float64)
+    assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 3
     assert (tmp_path / "mug.ipjax").is_file()
     assert picture.dtype == np.uint8 and picture.shape[2] == 3
     assert jax.tree.all(jax.tree.map(lambda x: bool(np.isfinite(x).all()), found.camera_from_object))
