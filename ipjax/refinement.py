@@ -243,7 +243,7 @@ def _search(rigid, strains, start, surface, cloud, pairs, config, unit):
         return value + jnp.sum(slopes * (step - here), axis=1)
 
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
-    solver = eqx.tree_at(lambda s: s.search, solver, _TrustRegion())
+    solver = eqx.tree_at(lambda s: s.search, solver, _Remembering(optx.ClassicalTrustRegion()))
     solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
     residuals = solution.state.f_info.residual
     before = 2 * solution.state.search_state.first / (residuals.shape[0] - strains)
@@ -291,16 +291,21 @@ class _Searched(eqx.Module):
     first: Float[Array, ""]
 
 
-class _TrustRegion(optx.ClassicalTrustRegion):
-    """Optimistix's, in the precision of the residuals (its own is the default precision); remembers the first value."""
+class _Remembering(optx.AbstractSearch[Any, Any, Any, _Searched]):
+    """A search in the precision of what is searched (Optimistix has the default precision), with the first value."""
 
-    def init(self, y, f_info_struct):
-        inner = jax.tree.map(lambda x: x.astype(y.dtype), super().init(y, f_info_struct))
+    inner: optx.AbstractSearch
+
+    def init(self, y: Any, f_info_struct: Any) -> _Searched:
+        inner = jax.tree.map(lambda x: x.astype(y.dtype), self.inner.init(y, f_info_struct))
         return _Searched(inner, jnp.zeros((), y.dtype))
 
-    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
-        *found, inner = super().step(first_step, y, y_eval, f_info, f_eval_info, state.inner)
-        return *found, _Searched(inner, jnp.where(first_step, f_eval_info.as_min(), state.first))
+    def step(
+        self, first_step: Any, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, state: _Searched
+    ) -> tuple[Any, Any, optx.RESULTS, _Searched]:
+        size, accept, result, inner = self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state.inner)
+        first = jnp.where(first_step, f_eval_info.as_min(), state.first)
+        return size, accept, result, _Searched(inner, first)
 
 
 @functools.partial(jax.jit, static_argnames="rigid")  # so that it is traced once
