@@ -4,13 +4,13 @@ import copy
 import dataclasses
 import json
 import struct
-import subprocess
 import sys
 import zipfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+import own_memory
 import pytest
 from test_objects import make_object
 from test_weights import Program, field, onnx_tensor, state_dict, write_pth
@@ -102,7 +102,7 @@ def test_hostile_files_take_no_memory_and_one_sentence(tmp_path):
         paths.append(tmp_path / str(i) / name)
         make(paths[-1])
     command = [sys.executable, "-c", READ, *map(str, paths)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = own_memory.run(command, timeout=120)
     assert done.returncode == 0, done.stderr
     for path, (_, _, words), line in zip(paths, HOSTILE, done.stdout.splitlines(), strict=True):
         said, megabytes = json.loads(line)

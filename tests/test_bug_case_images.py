@@ -32,6 +32,7 @@ READ = {
     "fisheye_4.yaml": ("equidistant", FOUR),
     "kannala_brandt4.yaml": ("equidistant", FOUR),
     "ros2_echo.yaml": ("plumb_bob", ROS2),
+    "P.txt": ("opencv", (), None, [[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]]),
     "kalibr.yaml": (
         "plumb_bob",
         (-0.28, 0.07, 0.0001, 0.00001),
@@ -53,7 +54,6 @@ READ = {
     ),
 }
 REFUSED = {
-    "P.txt": "12 numbers are no camera",
     "equi_5.yaml": "5 distortion coefficients do not fit",
     "plumb_bob_8.yaml": "8 distortion coefficients do not fit",
     "rational_5.yaml": "5 distortion coefficients do not fit",

@@ -7,11 +7,11 @@ import io
 import itertools
 import json
 import struct
-import subprocess
 import sys
 import zlib
 
 import numpy as np
+import own_memory
 import pytest
 from PIL import Image
 
@@ -181,7 +181,7 @@ def read(tmp_path_factory):
     folder = tmp_path_factory.mktemp("hostile")
     for name, (data, _) in FILES.items():
         (folder / name).write_bytes(data)
-    done = subprocess.run([sys.executable, "-c", CHILD, str(folder)], capture_output=True, text=True, timeout=300)
+    done = own_memory.run([sys.executable, "-c", CHILD, str(folder)], timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     return json.loads(done.stdout)
 

@@ -2,11 +2,11 @@
 
 import json
 import struct
-import subprocess
 import sys
 import zlib
 
 import numpy as np
+import own_memory
 import pytest
 from mesh_files import FACES, UV, VERTICES, Gltf, encode, pack_glb, write_obj
 from PIL import Image
@@ -240,7 +240,7 @@ def find_faults(name: str, words: str | None, answer: str, warned: list[str], pe
 def test_hostile_files_are_refused_in_a_sentence_or_read_small(tmp_path):
     """All in one process, one after the other: its memory at its largest is that of the worst of them."""
     names = [str(tmp_path / name) for name in write(tmp_path)]
-    done = subprocess.run([sys.executable, "-c", CHILD, *names], capture_output=True, text=True, timeout=300)
+    done = own_memory.run([sys.executable, "-c", CHILD, *names], timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     answers = json.loads(done.stdout)
     assert set(answers) == set(WORDS) and len(answers) > 40
