@@ -81,22 +81,15 @@ def _depth(path: Path) -> str:
     """The same frame with each of the depth files: all of them hold the same depth."""
     depth = read_depth(path)
     folder = path.parent
-    view = frame(
-        read_rgb(folder / "rgb.png"),
-        depth,
-        read_mask(folder / "mask.png"),
-        read_camera(folder / "camera.txt"),
-        depth_scale=1.0 if depth.dtype.kind == "f" else 1e-3,
+    rgb, mask, camera = (
+        read(folder / name)
+        for read, name in ((read_rgb, "rgb.png"), (read_mask, "mask.png"), (read_camera, "camera.txt"))
     )
+    unit = 1.0 if depth.dtype.kind == "f" else 1e-3
+    view = frame(rgb, depth, mask, camera, depth_scale=unit)
     known = np.asarray(view.depth)[np.asarray(view.depth) > 0]
     raw = np.load(path) if path.suffix == ".npy" else depth
-    again = frame(
-        read_rgb(folder / "rgb.png"),
-        raw,
-        read_mask(folder / "mask.png"),
-        read_camera(folder / "camera.txt"),
-        depth_scale=1.0 if depth.dtype.kind == "f" else 1e-3,
-    )
+    again = frame(rgb, raw, mask, camera, depth_scale=unit)
     farthest = float(np.asarray(again.depth).max())
     span = f"{known.min():.3f} to {known.max():.3f} m"
     return f"{depth.dtype.str}: crop from {span}; the array as NumPy loads it {farthest:.3f} m"

@@ -27,7 +27,7 @@ def time_in_turns(
     """Seconds of every call, run one after another ``repeats`` times; fewer (at least 3) once ``seconds`` are spent.
 
     With ``rest``, each timed call follows a pause of that many seconds and untimed calls for as long. Libraries with
-    threads of their own need it: threads that have just worked go on spinning (OpenBLAS's for some 25 ms) and take the
+    threads of their own need it: threads that have just worked go on spinning (OpenBLAS's do) and take the
     cores from whoever comes next, and those that wake up share a core for about as long.
     """
     for call in calls.values():

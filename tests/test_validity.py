@@ -295,7 +295,8 @@ def test_frame_refuses_images_and_cameras_that_are_no_numbers(place, bad):
 def poison_file(path, name: str, index, bad) -> None:
     """What `save` refuses to write."""
     with safe_open(path, framework="numpy") as file:
-        metadata, tensors = file.metadata(), {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        metadata, keys = file.metadata(), file.keys()
+        tensors = {key: file.get_tensor(key) for key in keys}
     tensors[name][index] = bad
     save_file(tensors, path, metadata=metadata)
 
