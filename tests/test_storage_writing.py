@@ -11,11 +11,10 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_weights import Server
+from test_weights import Server, serving
 
 from ipjax.host.storage import locked, publish, write_bytes, write_text, writing
 
@@ -219,13 +218,8 @@ def test_publish_names_the_file_that_the_user_knows(tmp_path):
 @pytest.fixture
 def slow_server():
     """Serves three megabytes; the second half comes when a test says so, and two downloads overlap."""
-    data = np.random.default_rng(0).bytes(3_000_000)
-    with Server(data) as running:
-        thread = threading.Thread(target=running.serve_forever, args=(0.02,), daemon=True)
-        thread.start()
+    with serving() as running:
         yield running
-        running.shutdown()
-        thread.join()
 
 
 def fetch(server: Server, cache: Path) -> subprocess.Popen:

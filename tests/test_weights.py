@@ -491,8 +491,9 @@ class Handler(http.server.BaseHTTPRequestHandler):
         pass
 
 
-@pytest.fixture
-def server():
+@contextlib.contextmanager
+def serving():
+    """A server of three megabytes, on a thread of its own."""
     data = np.random.default_rng(0).bytes(3_000_000)
     with Server(data) as running:
         thread = threading.Thread(target=running.serve_forever, args=(0.02,), daemon=True)
@@ -500,6 +501,12 @@ def server():
         yield running
         running.shutdown()
         thread.join()
+
+
+@pytest.fixture
+def server():
+    with serving() as running:
+        yield running
 
 
 def source_of(server: Server, sha256: str | None = "right") -> Source:
