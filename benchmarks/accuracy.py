@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import describe_device
+from ipjax.bop import run as studies
+from ipjax.bop.dataset import MM, Dataset, read_results
+from ipjax.bop.evaluation import Score, evaluate
 from ipjax.cli import _use_cache
-from ipjax.host import studies
-from ipjax.host.bop import MM, Dataset, read_results
-from ipjax.host.evaluation import Score, evaluate
-from ipjax.host.storage import write_text
-from ipjax.host.weights import load_encoder
+from ipjax.files.storage import write_text
+from ipjax.files.weights.encoders import load_encoder
 
 
 def run(dataset: Dataset, known, encoder, config: str, output: Path, *, keep: bool = False):
@@ -134,7 +134,7 @@ def main() -> None:
 
 def tell_reconstruction(dataset: Dataset, found: Score, finder, name: str, output: Path) -> None:
     """ADD-S and the long axis of what was found from a reconstructed mesh, and its picture."""
-    from ipjax.host.drawing import draw, gather_evidence, write_image
+    from ipjax.inference.drawing import draw, gather_evidence, write_image
 
     rows = {(r.scene_id, r.im_id, r.obj_id): r for r in read_results(next((output / name).glob("*.csv")))}
     for one in found.instances:

@@ -19,12 +19,12 @@ import numpy as np
 import ipjax
 from benchmarks.measure import describe_device
 from ipjax.config import Config
-from ipjax.features import observe
-from ipjax.host.frames import frame_turned
-from ipjax.host.reports import Plain, compose, invert
-from ipjax.host.storage import write_text
-from ipjax.pipeline import _Scene as Scene
-from ipjax.refinement import refine
+from ipjax.estimation.features import observe
+from ipjax.estimation.pipeline import _Scene as Scene
+from ipjax.estimation.refinement import refine
+from ipjax.files.storage import write_text
+from ipjax.inference.frames import frame_turned
+from ipjax.inference.reports import Plain, compose, invert
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
 import problems

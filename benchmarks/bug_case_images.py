@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ipjax.host.frames import frame
-from ipjax.host.images import read_camera, read_depth, read_mask, read_rgb
+from ipjax.files.images import read_camera, read_depth, read_mask, read_rgb
+from ipjax.inference.frames import frame
 
 SIZE = (640, 480)  # of the images that the cameras and masks were made for
 K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])

@@ -24,8 +24,8 @@ from scipy import optimize, stats
 from benchmarks.measure import commit
 from benchmarks.photo_pairs import states
 from ipjax.config import ConfidenceConfig
-from ipjax.host.storage import write_text, writing
-from ipjax.types import Agreement
+from ipjax.files.storage import write_text, writing
+from ipjax.records import Agreement
 
 PARTS = len(dataclasses.fields(Agreement))
 SOURCES = {"scan": "their mesh", "rgbd": "one RGB-D photo", "rgb": "one photo"}
@@ -105,7 +105,7 @@ def choose_ridge(rows: list[dict], *, drawn: bool = True) -> float:
 
 
 def chances(features: np.ndarray, weights) -> np.ndarray:
-    """As `ipjax.confidence.probability`."""
+    """As `ipjax.estimation.confidence.probability`."""
     return 1 / (1 + np.exp(-np.clip(features @ np.asarray(weights), -30, 30)))
 
 

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from ipjax.host import studies
-from ipjax.host.bop import MM, Dataset, Estimate, Frame, Target
-from ipjax.host.degradation import degrade
-from ipjax.host.evaluation import Alignment, evaluate, read_alignment
-from ipjax.host.meshes import Mesh, load_mesh
-from ipjax.host.weights import hash_file
+from ipjax.bop import run as studies
+from ipjax.bop.dataset import MM, Dataset, Estimate, Frame, Target
+from ipjax.bop.evaluation import Alignment, evaluate, read_alignment
+from ipjax.files.meshes.mesh import Mesh, load_mesh
+from ipjax.files.weights.encoders import hash_file
+from ipjax.synthetic.degradation import degrade
 
 INSTALL = "the classical baseline needs Open3D: pip install open3d"
 
@@ -84,7 +84,7 @@ def read_bodies(
     meshes: Mapping[int, Path] | None = None,
     alignments: Mapping[int, Path] | None = None,
 ) -> dict[int, Body]:
-    """The meshes that `ipjax.host.studies.prepare` onboards, with the scale that it keeps from the method."""
+    """The meshes that `ipjax.bop.run.prepare` onboards, with the scale that it keeps from the method."""
     wanted = {row.obj_id for row in dataset.targets}
     wanted = sorted(wanted if objects is None else wanted & set(objects))
     found = {}
@@ -105,7 +105,7 @@ def read_bodies(
 
 
 class Classical:
-    """An estimator for `ipjax.host.evaluation.evaluate`."""
+    """An estimator for `ipjax.bop.evaluation.evaluate`."""
 
     def __init__(self, bodies: Mapping[int, Body], settings: Settings = Settings(), *, seed: int = 0):
         self.open3d = import_open3d()

@@ -15,12 +15,12 @@ from typing import Any
 
 from benchmarks import results_page
 from benchmarks.classical import Classical, import_open3d, read_bodies
+from ipjax.bop import run as studies
+from ipjax.bop.dataset import Dataset, DatasetError
+from ipjax.bop.evaluation import Score, evaluate
 from ipjax.cli import _use_cache
-from ipjax.host import studies
-from ipjax.host.bop import Dataset, DatasetError
-from ipjax.host.evaluation import Score, evaluate
-from ipjax.host.storage import write_text
-from ipjax.host.weights import load_encoder
+from ipjax.files.storage import write_text
+from ipjax.files.weights.encoders import load_encoder
 
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s")
 # Where a data set's own notes doubt an annotation: reported with and without.

@@ -13,7 +13,7 @@ in the reference, and the size is found by the estimate; with depth, the measure
 
 In some synthetic scenes the object is also sought behind another object's mask, where it is not; those lines, and what
 each estimate says of its own certainty, are what `benchmarks.calibration` reads. For it, objects made in code can also
-be known from degraded meshes (``--methods level2``, see `ipjax.host.degradation`).
+be known from degraded meshes (``--methods level2``, see `ipjax.synthetic.degradation`).
 
 Results are lines of JSON, one per pair and method, written as they come: run again to go on. Templates are fewer than
 by default (24 × 8 instead of 40 × 10) for speed.
@@ -59,9 +59,9 @@ class Group:
     """A reference and the queries it is tried on; the object's points and symmetries are metres of its own frame."""
 
     object: str
-    mesh: Any  # ipjax.host.meshes.Mesh; its present frame is the object's
+    mesh: Any  # ipjax.files.meshes.mesh.Mesh; its present frame is the object's
     metres_per_unit: float  # of that mesh
-    model: Any  # ipjax.host.evaluation.Model
+    model: Any  # ipjax.bop.evaluation.Model
     reference: Shot
     queries: list[Shot]
     made: bool = True  # tried with the true mesh, too
@@ -79,8 +79,8 @@ def view_angle(first: Shot, second: Shot) -> float:
 
 def ycbv_groups(folder: Path, objects: tuple[int, ...] = (2, 3, 4, 5, 8, 10, 15)) -> Iterator[Group]:
     """Every frame of an object as the reference of all its frames in other scenes."""
-    from ipjax.host.bop import Dataset
-    from ipjax.host.evaluation import Model
+    from ipjax.bop.dataset import Dataset
+    from ipjax.bop.evaluation import Model
 
     dataset = Dataset(folder)
     frames: dict[int, list[tuple[int, int, Any]]] = {number: [] for number in objects}
@@ -116,12 +116,12 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
     """
     import jax.numpy as jnp
 
-    from ipjax.host.bop import Dataset
-    from ipjax.host.evaluation import Model
-    from ipjax.host.meshes import normalise
-    from ipjax.host.rendering import render_scene
-    from ipjax.host.synthetic import HEIGHT, KINDS, WIDTH, Sensor, _expose, _sense, make_object, make_scene
-    from ipjax.types import Similarity
+    from ipjax.bop.dataset import Dataset
+    from ipjax.bop.evaluation import Model
+    from ipjax.files.meshes.mesh import normalise
+    from ipjax.records import Similarity
+    from ipjax.rendering.render import render_scene
+    from ipjax.synthetic.scenes import HEIGHT, KINDS, WIDTH, Sensor, _expose, _sense, make_object, make_scene
 
     scans = []
     if data is not None:
@@ -197,13 +197,13 @@ def run(
 
     from benchmarks.measure import commit
     from ipjax.cli import _use_cache
-    from ipjax.host.degradation import degrade
-    from ipjax.host.estimation import Estimator
-    from ipjax.host.foreground import Photo
-    from ipjax.host.onboarding import onboard
-    from ipjax.host.photos import onboard_photo
-    from ipjax.host.weights import load_encoder
-    from ipjax.types import Camera
+    from ipjax.files.weights.encoders import load_encoder
+    from ipjax.inference.estimator import Estimator
+    from ipjax.onboarding.foreground import Photo
+    from ipjax.onboarding.mesh import onboard
+    from ipjax.onboarding.photo import onboard_photo
+    from ipjax.records import Camera
+    from ipjax.synthetic.degradation import degrade
 
     done = set()
     if output.exists():
@@ -286,8 +286,8 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
     """
     from scipy.spatial import KDTree
 
-    from ipjax.host.evaluation import Pose, surface_errors
-    from ipjax.host.reports import Plain, compose, relative_pose
+    from ipjax.bop.evaluation import Pose, surface_errors
+    from ipjax.inference.reports import Plain, compose, relative_pose
 
     info = estimator.objects[0][1]
     try:
@@ -338,7 +338,7 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
 
 def camera_from_true_mesh(camera_from_object, info, back: Any = None) -> tuple[np.ndarray, np.ndarray, float]:
     """An estimate as the pose of the mesh that was onboarded, or of the one that this is a degraded copy of."""
-    from ipjax.host.reports import Plain, compose, invert
+    from ipjax.inference.reports import Plain, compose, invert
 
     camera_from_mesh = compose(camera_from_object, info.object_from_mesh)
     if back is None:
@@ -407,7 +407,7 @@ def states(rows: list[dict]) -> str:
 def write_page(path: Path, text: str, measured: str) -> None:
     """The tables with what they rest on."""
     from benchmarks.measure import describe_device
-    from ipjax.host.storage import write_text
+    from ipjax.files.storage import write_text
 
     device = describe_device()
     head = [

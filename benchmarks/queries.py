@@ -16,10 +16,10 @@ from flax import nnx
 
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from ipjax.config import Config
-from ipjax.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
-from ipjax.features import describe
-from ipjax.pipeline import estimate
-from ipjax.types import Query
+from ipjax.estimation.features import describe
+from ipjax.estimation.pipeline import estimate
+from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
+from ipjax.records import Query
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
 import problems

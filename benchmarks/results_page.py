@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measure import commit, describe_device
-from ipjax.host.evaluation import FEW, SIZED
-from ipjax.host.storage import write_text
+from ipjax.bop.evaluation import FEW, SIZED
+from ipjax.files.storage import write_text
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
 HEADS = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
@@ -270,8 +270,8 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
     and the model at the estimate."""
     import cv2
 
-    from ipjax.host.bop import MM, Dataset, read_results
-    from ipjax.host.drawing import silhouette
+    from ipjax.bop.dataset import MM, Dataset, read_results
+    from ipjax.inference.drawing import silhouette
 
     run = study.main
     dataset = Dataset(study.data, run["dataset"].rsplit("-", 1)[1], models=study.models)
@@ -327,9 +327,9 @@ def draw_models(study: Study, chosen: list[dict], rows: dict) -> list[np.ndarray
     """The scanned model of each target at its estimate, on black: outlines cannot tell a front from a back."""
     import jax.numpy as jnp
 
-    from ipjax.host.bop import Dataset
-    from ipjax.host.rendering import render_each
-    from ipjax.types import Camera, Similarity
+    from ipjax.bop.dataset import Dataset
+    from ipjax.records import Camera, Similarity
+    from ipjax.rendering.render import render_each
 
     dataset = Dataset(study.data, study.main["dataset"].rsplit("-", 1)[1], models=study.models)
     pictures: list[np.ndarray] = [np.zeros(0)] * len(chosen)

@@ -16,15 +16,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.measure import describe_device
+from ipjax.bop.dataset import Dataset
 from ipjax.config import MatchConfig
-from ipjax.features import cut, describe, object_features, principal_basis
-from ipjax.host.bop import Dataset
-from ipjax.host.estimation import Estimator
-from ipjax.host.objects import compact, load
-from ipjax.host.storage import write_text
-from ipjax.host.weights import load_encoder
-from ipjax.matching import match
-from ipjax.types import Patches, Templates
+from ipjax.estimation.features import cut, describe, object_features, principal_basis
+from ipjax.estimation.matching import match
+from ipjax.files.object_file import compact, load
+from ipjax.files.storage import write_text
+from ipjax.files.weights.encoders import load_encoder
+from ipjax.inference.estimator import Estimator
+from ipjax.records import Patches, Templates
 
 BEST = 8  # templates that the estimate goes on with
 

@@ -9,14 +9,14 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
-from ipjax.alignment import align
 from ipjax.config import Config, MatchConfig
-from ipjax.host.objects import compact
-from ipjax.matching import match, select
-from ipjax.pipeline import _Scene as Scene
-from ipjax.pipeline import apparent_diameter, comparable, estimate
-from ipjax.refinement import refine
-from ipjax.scoring import score
+from ipjax.estimation.alignment import align
+from ipjax.estimation.matching import match, select
+from ipjax.estimation.pipeline import _Scene as Scene
+from ipjax.estimation.pipeline import apparent_diameter, comparable, estimate
+from ipjax.estimation.refinement import refine
+from ipjax.estimation.scoring import score
+from ipjax.files.object_file import compact
 
 sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
 import problems

@@ -8,7 +8,7 @@ import argparse
 import json
 from pathlib import Path
 
-from ipjax.host.storage import write_text
+from ipjax.files.storage import write_text
 
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 COLUMNS = {

@@ -26,8 +26,8 @@ def main() -> None:
     import numpy as np
     from flax import nnx
 
-    from ipjax import triposr
-    from ipjax.host import reconstruction
+    from ipjax.networks import triposr
+    from ipjax.onboarding import reconstruction
 
     seconds: dict[str, float] = {}
     start = last = time.perf_counter()

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
         RefineConfig,
         ScoreConfig,
     )
-    from ipjax.features import describe, observe
-    from ipjax.host.drawing import draw
-    from ipjax.host.frames import frame
-    from ipjax.host.objects import compact, load, pad_templates, save
-    from ipjax.host.onboarding import onboard
-    from ipjax.host.weights import load_encoder
-    from ipjax.pipeline import estimate
-    from ipjax.types import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
+    from ipjax.estimation.features import describe, observe
+    from ipjax.estimation.pipeline import estimate
+    from ipjax.files.object_file import compact, load, pad_templates, save
+    from ipjax.files.weights.encoders import load_encoder
+    from ipjax.inference.drawing import draw
+    from ipjax.inference.frames import frame
+    from ipjax.onboarding.mesh import onboard
+    from ipjax.records import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
 
 __version__ = "0.1.0"
 __all__ = [
@@ -70,14 +70,14 @@ _HOMES = {
         "RefineConfig",
         "ScoreConfig",
     ),
-    "features": ("describe", "observe"),
-    "host.drawing": ("draw",),
-    "host.frames": ("frame",),
-    "host.objects": ("compact", "load", "pad_templates", "save"),
-    "host.onboarding": ("onboard",),
-    "host.weights": ("load_encoder",),
-    "pipeline": ("estimate",),
-    "types": ("Camera", "Patches", "PoseEstimate", "Query", "Similarity", "Surface", "Templates", "View"),
+    "estimation.features": ("describe", "observe"),
+    "inference.drawing": ("draw",),
+    "inference.frames": ("frame",),
+    "files.object_file": ("compact", "load", "pad_templates", "save"),
+    "onboarding.mesh": ("onboard",),
+    "files.weights.encoders": ("load_encoder",),
+    "estimation.pipeline": ("estimate",),
+    "records": ("Camera", "Patches", "PoseEstimate", "Query", "Similarity", "Surface", "Templates", "View"),
 }
 _HOME = {name: f"ipjax.{module}" for module, names in _HOMES.items() for name in names}
 

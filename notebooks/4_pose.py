@@ -27,8 +27,8 @@ import numpy as np
 import ipjax
 from ipjax.cameras import project
 from ipjax.config import AlignConfig, Config, OnboardConfig
-from ipjax.host.onboarding import make_templates
-from ipjax.host.synthetic import make_object, make_scene
+from ipjax.onboarding.mesh import make_templates
+from ipjax.synthetic.scenes import make_object, make_scene
 
 plt.rcParams["figure.dpi"] = 60
 PATCH = 14

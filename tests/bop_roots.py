@@ -108,7 +108,7 @@ def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 1
     from PIL import Image
     from problems import AXES, random_rotation, see
 
-    from ipjax.types import Similarity
+    from ipjax.records import Similarity
 
     size = 200.0  # mm
     ball = trimesh.creation.icosphere(subdivisions=4)

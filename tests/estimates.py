@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ipjax.types import Agreement, Hypotheses, PoseEstimate, Similarity
+from ipjax.records import Agreement, Hypotheses, PoseEstimate, Similarity
 
 
 def make_estimate(pose: Similarity, *, success: bool = True, present: bool = True, turn: float = 0.0) -> PoseEstimate:

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from ipjax.features import describe
-from ipjax.host.viewpoints import viewpoints
-from ipjax.types import Appearance, Camera, Patches, Query, Similarity, Surface, Templates, View
+from ipjax.estimation.features import describe
+from ipjax.onboarding.viewpoints import viewpoints
+from ipjax.records import Appearance, Camera, Patches, Query, Similarity, Surface, Templates, View
 
 AXES = np.array([0.28, 0.38, 0.5])  # semi-axes; the longest makes the diameter 1
 PATCH = 14

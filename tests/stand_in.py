@@ -12,7 +12,7 @@ from problems import CoordinateEncoder, make_encoder
 
 import ipjax.cli
 from benchmarks import evaluation
-from ipjax.host import studies
+from ipjax.bop import run as studies
 
 
 class Named(CoordinateEncoder):

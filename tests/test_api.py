@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from test_layers import LAYERS, MODULES, layer_of
+from test_layers import FIRST_COMMAND, FIRST_IMPURE, MODULES, layer_of
 
 import ipjax
 
@@ -27,8 +27,8 @@ def is_public(name: str) -> bool:
     return not any(part.startswith("_") for part in name.split("."))
 
 
-PURE = [name for name in MODULES if layer_of(name) < LAYERS["ipjax.host"] and is_public(name)]
-HOST = [name for name in MODULES if layer_of(name) == LAYERS["ipjax.host"] and is_public(name)]
+PURE = [name for name in MODULES if layer_of(name) < FIRST_IMPURE and is_public(name)]
+REST = [name for name in MODULES if FIRST_IMPURE <= layer_of(name) < FIRST_COMMAND and is_public(name)]
 
 
 def list_functions(modules: list[str]) -> dict[str, typing.Any]:
@@ -59,7 +59,7 @@ def positional(function) -> list[str]:
 
 
 def is_architecture(annotation) -> bool:
-    return inspect.isclass(annotation) and annotation.__module__ in ("ipjax.dinov2", "ipjax.triposr")
+    return inspect.isclass(annotation) and annotation.__module__ in ("ipjax.networks.dinov2", "ipjax.networks.triposr")
 
 
 def find_disorder(name: str, function) -> list[str]:
@@ -117,7 +117,7 @@ def test_finds_what_cannot_be_mapped():
     assert find_unmappable("f", options) == []
 
 
-@pytest.mark.parametrize("module", [*PURE, *HOST])
+@pytest.mark.parametrize("module", [*PURE, *REST])
 def test_arguments_are_in_order(module):
     faults = [fault for name, function in list_functions([module]).items() for fault in find_disorder(name, function)]
     assert faults == []
@@ -138,7 +138,7 @@ def test_finds_disorder():
     assert find_disorder("good", good) == []
 
 
-@pytest.mark.parametrize("module", [*PURE, *HOST])
+@pytest.mark.parametrize("module", [*PURE, *REST])
 def test_everything_public_is_told(module):
     assert (importlib.import_module(module).__doc__ or "").strip(), f"{module} does not say what it is"
     for name, function in list_functions([module]).items():

@@ -11,7 +11,7 @@ from PIL import Image
 
 from ipjax import cameras
 from ipjax.cameras import mostly, project, unproject
-from ipjax.types import Camera
+from ipjax.records import Camera
 
 HEIGHT, WIDTH = 60, 84
 K = np.array([[70.3, 0, 40.2], [0, 68.9, 31.7], [0, 0, 1]])

@@ -13,31 +13,32 @@ import ipjax
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# Where a name stands: a module may import from lower numbers only. The stages of layer 3 do not import one another.
-LAYERS = {
-    "ipjax_kernels": 0,
-    "ipjax.types": 1,
-    "ipjax.config": 1,
-    "ipjax.cameras": 2,
-    "ipjax.dinov2": 2,
-    "ipjax.metrics": 2,
-    "ipjax.triposr": 2,
-    "ipjax.validity": 2,
-    "ipjax.features": 3,
-    "ipjax.matching": 3,
-    "ipjax.alignment": 3,
-    "ipjax.refinement": 3,
-    "ipjax.scoring": 3,
-    "ipjax.confidence": 3,
-    "ipjax.pipeline": 4,
-    "ipjax.host": 5,
-    "ipjax.cli": 6,
-    "ipjax.__main__": 7,
-    "ipjax": 8,  # the public names
-}
-MAY_SHARE = {  # modules of one layer that may import their neighbours, and why
-    "ipjax.triposr": {"ipjax.dinov2"},  # two vision transformers of one family share their blocks
-    "ipjax.scoring": {"ipjax.features"},  # what it draws is described as the templates were
+# From the first to the last: a module imports only from rows above its own, or from its own package.
+ORDER = [
+    ["ipjax_kernels"],
+    ["ipjax.records", "ipjax.config"],
+    ["ipjax.cameras"],
+    ["ipjax.metrics", "ipjax.networks"],
+    # The graph. Its stages do not import one another.
+    ["ipjax.estimation", "ipjax.estimation.validity"],
+    [f"ipjax.estimation.{s}" for s in ("features", "matching", "alignment", "refinement", "scoring", "confidence")],
+    ["ipjax.estimation.pipeline"],
+    # What cannot be jitted.
+    ["ipjax.progress"],
+    ["ipjax.files"],
+    ["ipjax.rendering"],
+    ["ipjax.inference"],
+    ["ipjax.onboarding", "ipjax.synthetic"],
+    ["ipjax.bop"],
+    ["ipjax.commands"],
+    ["ipjax.cli"],
+    ["ipjax.__main__"],
+    ["ipjax"],  # the public names
+]
+LAYERS = {name: row for row, names in enumerate(ORDER) for name in names}
+FIRST_IMPURE, FIRST_COMMAND = LAYERS["ipjax.progress"], LAYERS["ipjax.commands"]
+MAY_SHARE = {  # modules of one row that may import their neighbours, and why
+    "ipjax.estimation.scoring": {"ipjax.estimation.features"},  # what it draws is described as the templates were
 }
 HEAVY = {"mujoco", "cv2", "trimesh", "torch", "scipy", "skimage", "PIL", "matplotlib", "safetensors", "tqdm"}
 OF_KERNELS = {"jax", "jaxtyping", "numpy", "ipjax_kernels", *sys.stdlib_module_names}
@@ -57,11 +58,18 @@ MODULES = find_modules()
 
 
 def layer_of(name: str) -> int:
-    """The layer of a module, or of the nearest package above it that has one."""
-    while name not in LAYERS:
+    """The row of a module, or of the nearest package above it that has one."""
+    return LAYERS[package_of(name)]
+
+
+def package_of(name: str) -> str:
+    """The name in `ORDER` that a module belongs to."""
+    given = name
+    # A stage that ORDER does not name has no place; a module of any other package has its package's.
+    while name not in LAYERS or (name in ("ipjax", "ipjax.estimation") and name != given):
         name, _, _ = name.rpartition(".")
-        assert name, "a module outside ipjax and ipjax_kernels"
-    return LAYERS[name]
+        assert name, f"{given} has no place in ORDER"
+    return name
 
 
 def is_for_types(node: ast.AST) -> bool:
@@ -99,8 +107,12 @@ def find_faults(source: str, module: str, known: set[str]) -> list[str]:
     for line, name, _ in list_imports(source, module, known):
         if name.split(".")[0] not in ("ipjax", "ipjax_kernels"):
             continue
-        if module == name or (mine == layer_of(name) and mine in (0, 1, 5)):
-            continue  # kernels, records and host modules stand side by side
+        if (
+            module == name
+            or package_of(module) == package_of(name)
+            or mine == layer_of(name) == LAYERS["ipjax.records"]
+        ):
+            continue
         if name == "ipjax" and module != "ipjax":
             faults.append(f"{module}:{line} imports the public names; import the module that has them")
         elif layer_of(name) >= mine and name not in MAY_SHARE.get(module, ()):
@@ -111,6 +123,30 @@ def find_faults(source: str, module: str, known: set[str]) -> list[str]:
 @pytest.mark.parametrize("module", MODULES)
 def test_imports_only_from_layers_before(module):
     assert find_faults(MODULES[module].read_text(), module, set(MODULES)) == []
+
+
+def find_circles(imports: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of modules that need one another, directly or not."""
+    reached = {}
+    for start in imports:
+        seen, waiting = set(), [start]
+        while waiting:
+            for name in imports.get(waiting.pop(), ()):
+                if name not in seen:
+                    seen.add(name)
+                    waiting.append(name)
+        reached[start] = seen
+    return sorted({tuple(sorted(b for b in imports if b in reached[a] and a in reached[b])) for a in imports} - {()})
+
+
+def test_nothing_goes_in_a_circle():
+    imports = {
+        module: {name for _, name, _ in list_imports(path.read_text(), module, set(MODULES)) if name in MODULES}
+        for module, path in MODULES.items()
+        if module != "ipjax"  # its names are those of all modules, and only what is asked for is imported
+    }
+    assert find_circles({m: names - {"ipjax", m} for m, names in imports.items()}) == []
+    assert find_circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [("a", "b", "c")]
 
 
 def test_public_names_are_lazy_and_typed_as_they_are_found():
@@ -128,12 +164,12 @@ def test_public_names_are_lazy_and_typed_as_they_are_found():
     assert typed == ipjax._HOME and sorted(typed) == ipjax.__all__
     for name, module in typed.items():
         assert getattr(ipjax, name) is getattr(importlib.import_module(module), name)
-    assert ipjax.matching.match and set(ipjax.__all__) <= set(dir(ipjax))
+    assert ipjax.estimation.matching.match and set(ipjax.__all__) <= set(dir(ipjax))
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = ipjax.nothing
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if layer_of(name) < LAYERS["ipjax.host"]])
+@pytest.mark.parametrize("module", [name for name in MODULES if layer_of(name) < FIRST_IMPURE])
 def test_pure_layers_do_without_heavy_packages(module):
     for line, name, _ in list_imports(MODULES[module].read_text(), module, set(MODULES)):
         assert name.split(".")[0] not in HEAVY, f"{module}:{line} imports {name}"
@@ -153,19 +189,19 @@ def test_no_postponed_annotations():
 
 def test_finds_what_goes_back():
     known = set(MODULES)
-    assert find_faults("from ipjax.types import Camera", "ipjax.cameras", known) == []
-    assert find_faults("from ipjax.pipeline import estimate", "ipjax.matching", known)
-    assert find_faults("from ipjax.alignment import align", "ipjax.matching", known)
-    assert find_faults("from ipjax import host", "ipjax.scoring", known)
-    assert find_faults("def f():\n    import ipjax.host.meshes", "ipjax.features", known)
-    assert find_faults("from ipjax import __version__", "ipjax.host.objects", known) == []
-    assert find_faults("from ipjax import estimate", "ipjax.host.objects", known)
-    assert find_faults("import ipjax", "ipjax.types", known)
-    assert find_faults("from ipjax.types import Camera", "ipjax_kernels.similarity", known)
+    assert find_faults("from ipjax.records import Camera", "ipjax.cameras", known) == []
+    assert find_faults("from ipjax.estimation.pipeline import estimate", "ipjax.estimation.matching", known)
+    assert find_faults("from ipjax.estimation.alignment import align", "ipjax.estimation.matching", known)
+    assert find_faults("from ipjax import files", "ipjax.estimation.scoring", known)
+    assert find_faults("def f():\n    import ipjax.files.meshes.mesh", "ipjax.estimation.features", known)
+    assert find_faults("from ipjax import __version__", "ipjax.files.object_file", known) == []
+    assert find_faults("from ipjax import estimate", "ipjax.files.object_file", known)
+    assert find_faults("import ipjax", "ipjax.records", known)
+    assert find_faults("from ipjax.records import Camera", "ipjax_kernels.similarity", known)
 
 
 def test_import_is_light():
-    """``import ipjax`` loads the standard library at most; the pure names start no backend and load no host module."""
+    """``import ipjax`` loads the standard library at most; the pure names load pure modules, and start no backend."""
     code = """
 import sys, json
 before = set(sys.modules)
@@ -182,4 +218,5 @@ print(json.dumps([first, sorted(sys.modules), xla_bridge.backends_are_initialize
     heavy = {"mujoco", "cv2", "trimesh", "torch", "matplotlib", "onnx", "onnxruntime"}
     assert not heavy & {name.split(".")[0] for name in loaded}
     assert not started, "importing ipjax started a JAX backend"
-    assert not [name for name in loaded if name.startswith("ipjax.host.")]
+    impure = {name for name in MODULES if layer_of(name) >= FIRST_IMPURE and name != "ipjax"}
+    assert not impure & set(loaded)

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipjax import metrics
-from ipjax.types import Camera, Similarity
+from ipjax.records import Camera, Similarity
 
 GOLDEN = Path(__file__).resolve().parent / "golden"
 ERRORS = np.load(GOLDEN / "bop_pose_errors.npz")
@@ -347,7 +347,7 @@ def test_float64_stays_float64(x64):
 
 def test_shapes_are_named():
     script = (
-        "import jax.numpy as jnp\nfrom ipjax import metrics\nfrom ipjax.types import *\n"
+        "import jax.numpy as jnp\nfrom ipjax import metrics\nfrom ipjax.records import *\n"
         "c = Camera(jnp.ones(2), jnp.ones(2)); d = jnp.ones((4, 4))\n"
         "try: metrics.vsd(d, d, c, jnp.ones((4, 5)), diameter=1., delta=1.)\n"
         "except ValueError as e: print(e)\n"

@@ -12,10 +12,10 @@ import pytest
 import test_pipeline
 
 import ipjax
-from ipjax.host import onboarding
-from ipjax.host.meshes import save_mesh
-from ipjax.host.synthetic import PERFECT, make_object, make_scene
-from ipjax.host.weights import WeightsError, resolve
+from ipjax.files.meshes.mesh import save_mesh
+from ipjax.files.weights.encoders import WeightsError, resolve
+from ipjax.onboarding import mesh as onboarding
+from ipjax.synthetic.scenes import PERFECT, make_object, make_scene
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 

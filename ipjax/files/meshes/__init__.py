@@ -1,0 +1,1 @@
+"""Meshes, whoever made them: reading, cleaning, sampling, writing."""

@@ -1,0 +1,1 @@
+"""Weights of networks: found, fetched, checked, and read without running what is in them."""

@@ -1,1 +1,0 @@
-"""What cannot be jitted: files, meshes, rendering, weights, data sets."""

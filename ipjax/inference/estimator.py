@@ -1,0 +1,183 @@
+"""Estimating objects in frames on the host: crop, describe, estimate, and how long each took."""
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ipjax.config import Config
+from ipjax.estimation.features import describe
+from ipjax.estimation.pipeline import estimate
+from ipjax.files.object_file import ObjectInfo, compact
+from ipjax.inference.frames import frame_turned
+from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
+
+# Patches of compacted templates: every other count compiles anew, and objects differ; this makes two sizes of most.
+MULTIPLE = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One object in one frame: the estimate in the camera of the whole image, and what it came from."""
+
+    estimate: PoseEstimate
+    crop_estimate: PoseEstimate  # the same in the crop's camera, which a look-at crop turns
+    query: Query
+    templates: Templates
+    info: ObjectInfo
+    seconds: dict[str, float]  # frame, describe, estimate; compile where it happened
+    warnings: tuple[str, ...] = ()  # what speaks against the answer, a sentence each
+
+
+class Estimator:
+    """Objects and an encoder, ready for frames; compiles once for each shape of templates.
+
+    Templates lose their background when they are first used (`objects.compact`): the answers are the same, in about
+    half the time for matching.
+
+    Args:
+        objects: templates and what is known of them, as `objects.load` returns them.
+        encoder: made the templates' features.
+        config: of the estimate.
+        options: of `frames.frame_turned`; "square" crops by default.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[tuple[Templates, ObjectInfo]],
+        encoder: Any,
+        config: Config = Config(),
+        **options: Any,
+    ):
+        self.objects = list(objects)
+        self.encoder = encoder
+        self.config = config
+        self.options: dict[str, Any] = {"crop": "square"} | options
+        self._compiled: dict[Any, Any] = {}
+        self._compacted: dict[int, Templates] = {}
+
+    def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
+        """The crop of one object, without looking at it yet: bad input is refused here.
+
+        Raises:
+            ValueError: as `frames.frame`.
+        """
+        options: dict[str, Any] = {"resolution": self.objects[index][1].resolution} | self.options
+        return frame_turned(rgb, depth, mask, camera, box=box, **options)
+
+    def run(
+        self,
+        index: int,
+        view: Any,
+        camera_from_crop: Similarity,
+        *,
+        seed: int = 0,
+        diameter: float | None = None,
+        patches: Patches | None = None,
+    ) -> Result:
+        """Estimate one object in its crop.
+
+        Args:
+            index: of the object.
+            view, camera_from_crop: from `frame`.
+            seed: same seed, same answer.
+            diameter: the object's true diameter in metres, where it is known.
+            patches: of the view, where it has been described already.
+        """
+        templates, info = self.objects[index]
+        if self._compacted.get(index) is not templates:
+            templates = self._compacted[index] = compact(templates, multiple=MULTIPLE)
+            self.objects[index] = templates, info
+        seconds: dict[str, float] = {}
+        key = jax.random.key(seed)
+        known = None if diameter is None else jnp.asarray(diameter, jnp.float32)
+
+        described: Any = patches
+        if described is None:
+            see = self._ready("describe", describe, seconds, self.encoder, view)
+            start = time.perf_counter()
+            described = jax.block_until_ready(see(self.encoder, view))
+            seconds["describe"] = time.perf_counter() - start
+
+        query = Query(patches=described, view=view)
+        arguments = self.encoder, templates, query, key, self.config, known
+        find = self._ready("estimate", estimate, seconds, *arguments)
+        start = time.perf_counter()
+        found = jax.block_until_ready(find(*arguments))
+        seconds["estimate"] = time.perf_counter() - start
+        found, doubt = doubt_size(found, info, diameter, self.config.confidence.least)
+        warnings = (doubt,) if doubt else ()
+        return Result(_turn(camera_from_crop, found), found, query, templates, info, seconds, warnings)
+
+    def _ready(self, name: str, function: Any, seconds: dict[str, float], *args: Any):
+        leaves, structure = jax.tree.flatten(args)
+        shapes = tuple((np.shape(x), str(getattr(x, "dtype", type(x)))) for x in leaves)
+        key = (name, structure, shapes)
+        if key not in self._compiled:
+            start = time.perf_counter()
+            self._compiled[key] = jax.jit(function).lower(*args).compile()
+            seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - start
+        return self._compiled[key]
+
+
+def doubt_size(
+    found: PoseEstimate, info: ObjectInfo, diameter: float | None = None, least: float = 0.5
+) -> tuple[PoseEstimate, str]:
+    """The estimate with less confidence where its size is not the one that the mesh file says.
+
+    Args:
+        found: an estimate of the object.
+        info: of the object; nothing happens where its ``metres_per_unit`` is unknown.
+        diameter: the diameter in metres that was given instead of found: it is compared, and the confidence stays.
+        least: confidence below which the object counts as not present.
+
+    Returns:
+        The estimate and a sentence with the usual causes; "" where the sizes are within 25 % of each other. The
+        confidence falls by exp(−½ (ln ratio / ln 1.25)²): to 0.6 of itself at the limit, 0.01 at twice the size.
+    """
+    if info.metres_per_unit is None or not bool(found.success):
+        return found, ""
+    known = info.metres_per_unit / info.mesh_scale
+    size = float(found.camera_from_object.scale) if diameter is None else diameter
+    if not (np.isfinite(size) and size > 0):
+        return found, ""
+    ratio = size / known
+    doubt = abs(np.log(ratio)) / np.log(1.25)
+    if doubt <= 1:
+        return found, ""
+    compared = f"{1e3 * size:.4g} mm, {ratio:.3g} times the {1e3 * known:.4g} mm of its mesh file"
+    if diameter is not None:
+        return found, f"{info.name}: the diameter given is {compared}"
+    confidence = jnp.asarray(float(found.confidence) * np.exp(-0.5 * doubt**2), found.confidence.dtype)
+    found = dataclasses.replace(found, confidence=confidence, present=found.present & (confidence >= least))
+    return found, (
+        f"{info.name}: the size found is {compared}: is the camera matrix of images of another size, the unit of the "
+        "depth (--depth-scale) another, or the unit of the mesh (onboard --unit)?"
+    )
+
+
+def _turn(camera_from_crop: Similarity, found: PoseEstimate) -> PoseEstimate:
+    """The estimate in the camera of the whole image: the crop's camera is only turned."""
+    turn = np.asarray(camera_from_crop.rotation, np.float64)
+    if np.array_equal(turn, np.eye(3)):
+        return found
+
+    def turned(pose: Similarity) -> Similarity:
+        rotation = turn @ np.asarray(pose.rotation, np.float64)
+        translation = np.asarray(pose.translation, np.float64) @ turn.T
+        return Similarity(jnp.asarray(rotation, jnp.float32), jnp.asarray(translation, jnp.float32), pose.scale)
+
+    both = np.kron(np.eye(2), turn)
+    covariance = both @ np.asarray(found.covariance, np.float64) @ both.T
+    return dataclasses.replace(
+        found,
+        covariance=jnp.asarray(covariance, jnp.float32),
+        camera_from_object=turned(found.camera_from_object),
+        hypotheses=dataclasses.replace(
+            found.hypotheses, camera_from_object=turned(found.hypotheses.camera_from_object)
+        ),
+    )

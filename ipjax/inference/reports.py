@@ -1,0 +1,198 @@
+"""Estimates as JSON: every frame and unit named, and poses told in the user's own mesh coordinates."""
+
+import dataclasses
+import json
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ipjax.files.object_file import ObjectInfo
+from ipjax.records import PoseEstimate, Similarity, Templates
+
+CONVENTIONS = {
+    "camera": "OpenCV axes of the colour camera: x right, y down, z ahead; metres; pixel centres are integers",
+    "mesh": "coordinates as they stand in the mesh file, in the file's own unit",
+    "mesh_of_a_photo": "of an object made from a photo: the reconstruction, as 'onboard --save-mesh' writes it",
+    "reference_camera": "camera of the photo that the object was made from, OpenCV axes; metres where that photo had "
+    "depth (reference_unit is 'm'), else the reconstruction's own unit (reference_unit is null)",
+    "camera_from_reference_camera": "pose relative to the reference photo: maps coordinates of the reference camera to "
+    "metres of this frame's camera; rigid_motion (where reference_unit is 'm') is the same at scale 1, exact at the "
+    "object's centre",
+    "object": "normalised object: bounding box centred at the origin, diameter 1 (model units)",
+    "similarity": "x_camera = scale * rotation @ x + translation; rotation row by row",
+    "matrix": "4 x 4, row by row, [scale * rotation, translation; 0 0 0 1]: x_camera = matrix @ (x, 1)",
+    "rigid_matrix": "4 x 4, row by row, [rotation, translation; 0 0 0 1]: x_camera = rigid_matrix @ (scale * x, 1)",
+    "present": "false: the object is not here, or not seen well enough, and the pose is a guess; by confidence",
+    "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter; "
+    "of method paper: the share of pairs that agree",
+    "covariance": "6 x 6, of rotation vector (rad, about the object's centre) and translation (m), camera axes",
+    "ambiguity": "the object's axis about which it may be turned, and by how much (standard deviation)",
+    "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
+}
+
+UNSURE_TURN = 25.0  # degrees of standard deviation from which people are told about it
+
+
+class Plain(NamedTuple):
+    """A similarity of doubles: the records of `ipjax.records` are JAX arrays, which keep floats only."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    scale: Any
+
+
+def compose(a_from_b: Similarity | Plain, b_from_c: Similarity | Plain) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation, translation and scale of ``a_from_c``, in double precision."""
+    outer, inner = (
+        tuple(np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
+        for pose in (a_from_b, b_from_c)
+    )
+    rotation = outer[0] @ inner[0]
+    return rotation, outer[2] * outer[0] @ inner[1] + outer[1], float(outer[2] * inner[2])
+
+
+def tell_pose(rotation: np.ndarray, translation: np.ndarray, scale: float, unit: str) -> dict[str, Any]:
+    """A similarity to camera metres as JSON can say it; `unit` names what the scale is per."""
+    rigid, full = np.eye(4), np.eye(4)
+    rigid[:3, :3], full[:3, :3] = rotation, scale * rotation
+    rigid[:3, 3] = full[:3, 3] = translation
+    return {
+        "matrix": full.tolist(),
+        "rigid_matrix": rigid.tolist(),
+        "rotation": rotation.tolist(),
+        "translation_m": translation.tolist(),
+        f"scale_m_per_{unit}": scale,
+    }
+
+
+def invert(a_from_b: Similarity | Plain) -> Plain:
+    """``b_from_a``, in double precision."""
+    rotation, translation, scale = (
+        np.asarray(x, np.float64) for x in (a_from_b.rotation, a_from_b.translation, a_from_b.scale)
+    )
+    return Plain(rotation.T, -rotation.T @ translation / scale, 1 / scale)
+
+
+def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> tuple[np.ndarray, np.ndarray, float]:
+    """``camera_from_reference_camera`` of an estimate: rotation, translation (metres), scale (metres per unit there).
+
+    Raises ValueError for an object that was not made from a photo.
+    """
+    if info.reference is None:
+        raise ValueError("the object was not made from a photo")
+    camera_from_mesh = Plain(*compose(camera_from_object, info.object_from_mesh))
+    return compose(camera_from_mesh, invert(info.reference.camera_from_mesh))
+
+
+def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict[str, Any]:
+    """The pose relative to the reference photo as JSON can say it, with scale and, where the photo had depth, without.
+
+    Raises ValueError as `relative_pose`.
+    """
+    rotation, translation, scale = relative_pose(camera_from_object, info)
+    assert info.reference is not None
+    told = tell_pose(rotation, translation, scale, "reference_unit")
+    told["reference_unit"] = "m" if info.reference.metric else None
+    told["reference_photo"] = info.reference.file
+    told["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+    if info.reference.metric:
+        # A wrong scale about the camera would move the object: it is taken out about the object's centre.
+        centre = np.asarray(info.mesh_centre, np.float64)[None]
+        reference = info.reference
+        there = reference.scale * centre @ np.asarray(reference.rotation).T + np.asarray(reference.translation)
+        here = scale * there @ rotation.T + translation
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = rotation, (here - there @ rotation.T)[0]
+        told["rigid_motion"] = motion.tolist()
+    return told
+
+
+def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo, alternatives: int = 4) -> dict:
+    """One object's estimate as JSON can say it; `pose` is null where none was found.
+
+    ``camera_from_mesh`` maps the coordinates of the user's mesh file to camera metres; ``camera_from_object`` maps the
+    normalised object.
+    """
+    found = bool(estimate.success) and all(
+        np.isfinite(np.asarray(x)).all()
+        for x in (
+            estimate.camera_from_object.rotation,
+            estimate.camera_from_object.translation,
+            estimate.camera_from_object.scale,
+        )
+    )
+    told: dict[str, Any] = {
+        "object": info.name,
+        "mesh_file": info.mesh_file,
+        "mesh_sha256": info.mesh_sha256,
+        "success": found,
+        "present": found and bool(estimate.present),
+        "confidence": float(estimate.confidence) if found else 0.0,
+        "camera_from_mesh": None,
+        "camera_from_object": None,
+    }
+    if not found:
+        return told
+    pose = estimate.camera_from_object
+    rotation, translation, scale = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
+    told["camera_from_mesh"] = tell_pose(*compose(pose, info.object_from_mesh), "mesh_unit")
+    told["camera_from_object"] = tell_pose(rotation, translation, float(scale), "model_unit")
+    if info.reference is not None:
+        told["camera_from_reference_camera"] = tell_relative_pose(pose, info)
+    told["size_mm"] = {
+        "diameter": 1e3 * float(scale),
+        "box": [1e3 * float(scale) * float(side) for side in np.asarray(templates.extents)],
+        "diameter_std": 1e3 * float(estimate.scale_std),
+    }
+    told["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
+    turn = np.asarray(estimate.ambiguity, np.float64)
+    length = float(np.linalg.norm(turn))
+    told["ambiguity"] = {
+        "axis_of_object": (turn / max(length, 1e-12)).tolist(),
+        "std_deg": float(np.degrees(length)),
+    }
+    told["agreement"] = {
+        part.name: float(getattr(estimate.agreement, part.name)) for part in dataclasses.fields(estimate.agreement)
+    }
+    if info.metres_per_unit is not None:
+        told["size_from_mesh_mm"] = {"diameter": 1e3 * info.metres_per_unit / info.mesh_scale}
+    told["inliers"] = int(estimate.inliers)
+    told["residual_rms_mm"] = 1e3 * float(estimate.rmse)
+    told["template"] = int(estimate.view)
+    told["alternatives"] = []
+    scores = np.asarray(estimate.hypotheses.score)
+    for i in range(1, min(alternatives + 1, len(scores))):
+        many = estimate.hypotheses.camera_from_object
+        other = Similarity(many.rotation[i], many.translation[i], many.scale[i])
+        finite = all(np.isfinite(np.asarray(x)).all() for x in (other.rotation, other.translation, other.scale))
+        if scores[i] <= 0 or not finite:
+            continue
+        told["alternatives"].append(
+            {
+                "score": float(scores[i]),
+                "camera_from_mesh": tell_pose(*compose(other, info.object_from_mesh), "mesh_unit"),
+            }
+        )
+    return told
+
+
+def to_json(value: Any) -> str:
+    """JSON with short lists of numbers on one line each, so that matrices can be read.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+
+    def is_flat(item: Any) -> bool:
+        return isinstance(item, list) and all(isinstance(x, int | float | str) for x in item)
+
+    def text(item: Any, indent: int) -> str:
+        pad = "  " * (indent + 1)
+        if isinstance(item, dict) and item:
+            inner = ",\n".join(f"{pad}{json.dumps(str(k))}: {text(v, indent + 1)}" for k, v in item.items())
+            return "{\n" + inner + "\n" + "  " * indent + "}"
+        if isinstance(item, list) and item and not is_flat(item):
+            return "[\n" + ",\n".join(pad + text(v, indent + 1) for v in item) + "\n" + "  " * indent + "]"
+        return json.dumps(item, allow_nan=False, ensure_ascii=False)
+
+    return text(value, 0) + "\n"

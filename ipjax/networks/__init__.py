@@ -1,0 +1,1 @@
+"""The networks, in Flax: arrays in, arrays out, and weights by name."""

@@ -1,0 +1,1 @@
+"""From a mesh or a photo to an object that can be found."""

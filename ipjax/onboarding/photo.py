@@ -1,0 +1,265 @@
+"""From one photo to an object that can be found: mask, mesh, templates, and where the photo's camera stood."""
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ipjax.cameras import resize, resize_pixels
+from ipjax.config import OnboardConfig
+from ipjax.files.camera_files import Intrinsics, as_intrinsics, list_misfits, read_camera
+from ipjax.files.images import as_native, forget_sentinel, read_depth, read_mask
+from ipjax.files.object_file import ObjectInfo, Reference, save
+from ipjax.files.weights.encoders import WeightsError, hash_file
+from ipjax.inference import frames
+from ipjax.networks.dinov2 import Encoder
+from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo
+from ipjax.onboarding.mesh import onboard
+from ipjax.onboarding.reconstructed import Reconstruction
+from ipjax.onboarding.reconstruction import Progress, load_triposr, reconstruct, resolve_triposr
+from ipjax.records import Camera, Templates
+
+log = logging.getLogger("ipjax")
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+_PICTURE = 320  # pixels, longest side of the kept photo
+
+
+@dataclasses.dataclass(frozen=True)
+class PhotoObject:
+    """An object made from a photo, and what it came from."""
+
+    templates: Templates
+    info: ObjectInfo
+    foreground: Foreground
+    reconstruction: Reconstruction
+
+
+@dataclasses.dataclass(frozen=True)
+class Shot:
+    """A photo with its mask, and its depth and camera where they are known; all of one size."""
+
+    foreground: Foreground
+    depth: np.ndarray | None  # along z, metres, 0 = unknown
+    camera: Camera | None
+
+
+def onboard_photo(
+    source: str | Path | Photo,
+    encoder: Encoder | None = None,
+    config: OnboardConfig = OnboardConfig(),
+    *,
+    mask: Any = None,
+    box: Sequence[int | float] | None = None,
+    click: Sequence[int | float] | None = None,
+    depth: Any = None,
+    camera: Any = None,
+    depth_scale: float | None = None,
+    lrm: str = "auto",
+    lrm_weights: str | Path | None = None,
+    tried: str | Path | None = None,
+    out: str | Path | None = None,
+    name: str | None = None,
+    progress: bool = True,
+    backend: str = "auto",
+) -> PhotoObject:
+    """Make an object ready to be found from one photo of it.
+
+    Args:
+      source: a photo's file, or a `Photo`.
+      encoder: default: the best weights that are here.
+      mask: file, or height × width: the object. Default: transparency, ``box``, ``click``, or a plain background.
+      box: (x, y, width, height) around the object, pixels of the photo's file.
+      click: (x, y) on the object, likewise.
+      depth: file, or height × width along z, aligned to the photo; needs ``camera``. The object is then in metres.
+      camera: anything `images.read_camera` or `as_intrinsics` takes.
+      depth_scale: metres per unit of depth; default: the camera file's, else 1 for floats.
+      lrm: "triposr" (needs its weights), "inflate" (needs none), or "auto": what was measured where there is depth,
+        else TripoSR where its weights are, else inflation. Nothing is downloaded.
+      lrm_weights: TripoSR's checkpoint; default: IPJAX_TRIPOSR, or the cache.
+      tried: where a picture goes when no mask is found.
+      out: also write the object file.
+      name: default: the file's.
+
+    Raises:
+      ValueError: no usable photo, mask, depth, camera or weights; one sentence.
+    """
+    shot = take_shot(
+        source, mask=mask, box=box, click=click, depth=depth, camera=camera, depth_scale=depth_scale, tried=tried
+    )
+    made, method = _reconstruct(shot, lrm, lrm_weights, _say if progress else None)
+    path = None if isinstance(source, Photo) else Path(source)
+    name = name or (path.stem if path else "object")
+    templates, info = onboard(made.mesh, encoder, config, name=name, progress=progress, backend=backend)
+    info = dataclasses.replace(
+        info,
+        mesh_file=path.name if path else "",
+        mesh_sha256=hash_file(path) if path else "",
+        metres_per_unit=1.0 if made.metric else None,
+        notes=(*made.report, *info.notes),
+        reference=_describe(path, shot, made, method, info, templates),
+    )
+    if out is not None:
+        save(out, templates, info)
+    return PhotoObject(templates, info, shot.foreground, made)
+
+
+def take_shot(
+    source: str | Path | Photo,
+    *,
+    mask: Any = None,
+    box: Sequence[int | float] | None = None,
+    click: Sequence[int | float] | None = None,
+    depth: Any = None,
+    camera: Any = None,
+    depth_scale: float | None = None,
+    tried: str | Path | None = None,
+) -> Shot:
+    """Read a photo with all that belongs to it, find the object in it, and undo the lens; see `onboard_photo`.
+
+    Raises ValueError in one sentence: whatever is unreadable, does not fit, or has no unit.
+    """
+    if depth is not None and camera is None:
+        raise ValueError("depth without its camera has no metric points: give the camera too")
+    if sum(option is not None for option in (mask, box, click)) > 1:
+        raise ValueError("give one of mask, box and click, not several")
+    photo = source if isinstance(source, Photo) else read_photo(source)
+    beside = [name for name, value in (("mask", mask), ("depth", depth), ("camera", camera)) if value is not None]
+    if photo.orientation != 1 and beside and not isinstance(source, Photo):
+        raise ValueError(
+            f"{source}: its EXIF orientation ({photo.orientation}) says that it is to be shown turned, and nothing "
+            f"says whether {' and '.join(beside)} belong to it as stored or as shown; save all of them the same way up"
+        )
+    mask = read_mask(mask) if isinstance(mask, str | Path) else mask
+    depth = read_depth(depth) if isinstance(depth, str | Path) else depth
+    intrinsics = None
+    if camera is not None:
+        intrinsics = read_camera(camera) if isinstance(camera, str | Path | dict) else as_intrinsics(camera)
+    height, width = photo.rgb.shape[:2]
+    if intrinsics is not None and intrinsics.size is not None:
+        full = (width / photo.scale, height / photo.scale)
+        if any(abs(a - b) > 1.5 / photo.scale for a, b in zip(intrinsics.size, full, strict=True)):
+            raise ValueError(
+                f"the camera belongs to images of {intrinsics.size[0]} × {intrinsics.size[1]} pixels, "
+                f"but the photo has {full[0]:.0f} × {full[1]:.0f}"
+            )
+    if box is not None:
+        if len(box) != 4 or not (box[2] > 0 and box[3] > 0):
+            raise ValueError("a box is x, y, width, height in pixels, with a positive size")
+        box = (box[0], box[1], box[0] + box[2], box[1] + box[3])
+    if click is not None and len(click) != 2:
+        raise ValueError("a click is x, y in pixels")
+    foreground = find_foreground(photo, mask=mask, box=box, click=click, tried=tried)
+    if intrinsics is not None:
+        for misfit in list_misfits(intrinsics, round(width / photo.scale), round(height / photo.scale)):
+            log.warning("camera: %s", misfit)
+    metres = None
+    if depth is not None:
+        assert intrinsics is not None
+        metres = _to_metres(np.asarray(depth), foreground.mask, photo.scale, depth_scale, intrinsics)
+    if intrinsics is None:
+        return Shot(foreground, None, None)
+    whole = photo.full_size or (width / photo.scale, height / photo.scale)
+    intrinsics = dataclasses.replace(intrinsics, matrix=resize(intrinsics.matrix, whole, (width, height)))
+    if intrinsics.distortion:
+        nothing = np.zeros((height, width), np.float32)
+        rgb, metres_, found, _ = frames._undistort(
+            foreground.rgb, nothing if metres is None else metres, foreground.mask, None, intrinsics
+        )
+        metres = None if depth is None else metres_
+        foreground = dataclasses.replace(
+            foreground,
+            rgb=rgb,
+            mask=np.asarray(found),
+            alpha=np.uint8(255) * np.asarray(found, np.uint8),
+            notes=(*foreground.notes, "the lens's distortion was undone"),
+        )
+    return Shot(foreground, metres, intrinsics.camera)
+
+
+def _to_metres(
+    depth: np.ndarray, mask: np.ndarray, scale: float, depth_scale: float | None, intrinsics: Intrinsics
+) -> np.ndarray:
+    """The depth image in metres, as large as the photo as it was read (which may have been reduced)."""
+    depth = as_native(depth)
+    if depth.ndim != 2:
+        raise ValueError(f"depth has one number per pixel, not the shape {list(depth.shape)}")
+    depth, unknown = forget_sentinel(depth)
+    if unknown:
+        log.info("%s", unknown)
+    height, width = mask.shape
+    unit = frames._depth_scale(depth, depth_scale, intrinsics)
+    if depth.shape != mask.shape:
+        if any(abs(d * scale - p) > 1.0 for d, p in zip(depth.shape, mask.shape, strict=True)):
+            raise ValueError(
+                f"the photo has {width / scale:.0f} × {height / scale:.0f} pixels, the depth image "
+                f"{depth.shape[1]} × {depth.shape[0]}: align the depth to the photo first"
+            )
+        wide, high = (
+            resize_pixels(np.arange(after, dtype=float)[:, None], (after, after), (before, before))[:, 0]
+            for before, after in zip(depth.shape[::-1], (width, height), strict=True)
+        )
+        known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+        depth = frames.sample_depth(known, wide[None, :], high[:, None])
+    frames._check_unit(depth, mask, (0, 0, width, height), unit)
+    return frames._metres(depth, unit)
+
+
+def _reconstruct(
+    shot: Shot, lrm: str, weights: str | Path | None, progress: Progress | None
+) -> tuple[Reconstruction, str]:
+    """The mesh, and who made it: "triposr", "depth" or "inflate"."""
+    if lrm not in ("auto", "triposr", "inflate"):
+        raise ValueError(f"the reconstruction is 'auto', 'triposr' or 'inflate', not {lrm!r}")
+    model, missing = None, ""
+    if lrm == "triposr" or (lrm == "auto" and shot.depth is None):
+        try:
+            model = load_triposr(resolve_triposr(weights).path)
+        except WeightsError:
+            if lrm == "triposr" or weights is not None:
+                raise
+            missing = "TripoSR's weights are not here, so the mesh was made without learned weights"
+    made = reconstruct(
+        shot.foreground, method=lrm, depth=shot.depth, camera=shot.camera, model=model, progress=progress
+    )
+    if missing:
+        made = dataclasses.replace(made, report=(*made.report, missing))
+    return made, "triposr" if model is not None else "depth" if shot.depth is not None else "inflate"
+
+
+def _say(stage: str, share: float) -> None:
+    print(f"\rreconstructing: {stage} {share:.0%}  ", end="\n" if share >= 1 else "", flush=True)
+
+
+def _describe(
+    path: Path | None, shot: Shot, made: Reconstruction, method: str, info: ObjectInfo, templates: Templates
+) -> Reference | None:
+    import cv2
+
+    if made.camera_from_mesh is None or made.camera is None:
+        return None
+    pose, lens = made.camera_from_mesh, made.camera
+    image = shot.foreground.rgb
+    height, width = image.shape[:2]
+    zoom = min(1.0, _PICTURE / max(height, width))
+    small = cv2.resize(image, (max(1, round(width * zoom)), max(1, round(height * zoom))), interpolation=cv2.INTER_AREA)
+    _, code = cv2.imencode(".jpg", np.ascontiguousarray(small[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, 85])
+    focal, centre = (np.asarray(x, np.float64) for x in (lens.focal, lens.centre))
+    return Reference(
+        file=path.name if path else "",
+        sha256=hash_file(path) if path else "",
+        rotation=np.asarray(pose.rotation, np.float64),
+        translation=np.asarray(pose.translation, np.float64),
+        scale=float(pose.scale),
+        focal=(float(focal[0]), float(focal[1])),
+        centre=(float(centre[0]), float(centre[1])),
+        size=(int(width), int(height)),
+        camera_given=shot.camera is not None and method != "triposr",
+        metric=made.metric,
+        method=method,
+        seen=float(np.asarray(templates.surface.seen).mean()),
+        picture=code.tobytes(),
+    )

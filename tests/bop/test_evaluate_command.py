@@ -1,0 +1,155 @@
+"""``ipjax evaluate`` and the page of results, as commands, on a small exact data set with a stand-in encoder."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bop_roots import write_ellipsoids
+
+HERE = Path(__file__).resolve().parents[1]
+VIEWS = ["--directions", "6", "--rolls", "4"]
+SETTINGS = {
+    "quick": {"from": "paper", "match": {"views": 2, "pairs": 32}, "align": {"count": 64}},
+    "quicker": {"from": "paper", "match": {"views": 1, "pairs": 24}, "align": {"count": 32}},
+}
+
+
+def start(*words, pause: float = 0.0) -> subprocess.Popen:
+    environment = dict(os.environ, JAX_COMPILATION_CACHE_DIR=str(HERE.parent / "build" / "xla-cache"))
+    roots = [str(HERE.parent), str(HERE.parent / "kernels"), *sys.path]
+    environment["PYTHONPATH"] = os.pathsep.join(p for p in roots if p)
+    return subprocess.Popen(
+        [sys.executable, str(HERE / "stand_in.py"), str(pause), *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=environment,
+    )
+
+
+def finish(process: subprocess.Popen) -> str:
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 0, out[-3000:]
+    return out
+
+
+def results(folder: Path) -> tuple[list[str], dict]:
+    """The lines of the result file without their times, and the score without its times."""
+    (path,) = folder.glob("*-test.csv")
+    score = json.loads((folder / "score.json").read_text())
+    del score["seconds_per_image"]
+    return [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()], score
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("evaluate")
+    write_ellipsoids(folder / "balls")
+    for name, entry in SETTINGS.items():
+        (folder / f"{name}.json").write_text(json.dumps(entry))
+    return folder
+
+
+def evaluate(place: Path, out: str, *more, pause: float = 0.0) -> subprocess.Popen:
+    words = ["ipjax", "evaluate", place / "balls", "--objects", place / "objects", "-o", place / out]
+    return start(*words, "--config", place / "quick.json", "--quiet", *VIEWS, *more, pause=pause)
+
+
+@pytest.fixture(scope="module")
+def whole(place) -> str:
+    """An uninterrupted run."""
+    return finish(evaluate(place, "whole", "--without", "1/0"))
+
+
+def test_the_tables_are_printed(place, whole):
+    rows, score = results(place / "whole")
+    assert len(rows) == 1 + 6
+    assert score["all_frames"]["recalls"]["ar"] > 0.4  # the set can be solved, so equal numbers mean something
+    for word in ("AR_VSD", "AR_MSSD", "AR_MSPD", "one frame per scene", "all frames, without 1/0", "Median errors"):
+        assert word in whole
+    assert "size to 5 %" in whole  # the sizes are kept beside the BOP file, and the command finds them there
+    (path,) = (place / "whole").glob("*-test.csv")
+    again = finish(start("ipjax", "score", path, place / "balls", "--metrics", "mssd", "mspd"))
+    sized = [
+        [x.split() for x in out.splitlines() if x.startswith("all frames ") and x.count("[") == 5]
+        for out in (whole, again)
+    ]
+    assert len(sized[0]) == 1 and sized[0] == sized[1]
+    assert re.search(r"Time per image: \d", whole) and re.search(r"\d\.\d \[\d", whole)
+
+
+def test_killed_at_once_and_run_again_it_gives_the_same_numbers(place, whole):
+    for kills in (1, 3):
+        process = evaluate(place, "killed", "--without", "1/0", pause=0.4)
+        journal, begin = place / "killed" / "results.jsonl", time.monotonic()
+        while not journal.is_file() or journal.read_bytes().count(b"\n") < 1 + kills:
+            assert process.poll() is None and time.monotonic() - begin < 240
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
+        process.communicate()
+        assert kills <= journal.read_bytes().count(b"\n") - 1 < 6
+        assert not (place / "killed" / "score.json").exists()
+    with open(journal, "ab") as file:
+        file.write(b'{"image": [1, ')  # what a crash in the middle of a write leaves
+    finish(evaluate(place, "killed", "--without", "1/0"))
+    images = [json.loads(line)["image"] for line in journal.read_text().splitlines()[1:]]
+    assert sorted(images) == [[s, i] for s in range(2) for i in range(3)]  # none twice, none lost
+    assert results(place / "killed") == results(place / "whole")
+
+
+def test_other_settings_are_refused(place, whole):
+    process = evaluate(place, "whole", "--seed", "1")
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 2 and "other settings (settings.seed)" in out and "Traceback" not in out
+
+
+def test_one_command_runs_all_and_makes_the_page(place, whole):
+    words = ["benchmark", place / "balls", "--methods", place / "quicker.json", place / "quick.json", "--quiet"]
+    words += ["--objects", place / "objects", "-o", place / "study", "--page", place / "page" / "accuracy"]
+    out = finish(start(*words))
+    # The second method uses what the first has loaded and described, and its answers are the same.
+    assert "shared: True 1" in out
+    mine, theirs = results(place / "study" / "balls" / "scans" / "quick"), results(place / "whole")
+    assert mine[0] == theirs[0]
+    assert mine[1]["all_frames"] == theirs[1]["all_frames"]
+    assert out.count("one frame per scene") == 2 * 2 and "Objects won against ipjax-quicker" in out
+    text = (place / "page" / "accuracy.md").read_text()
+    ar = f"{100 * mine[1]['one_frame_per_scene']['recalls']['ar']:.1f}"
+    assert re.search(rf"\| balls, scans \| ipjax-quick \| 2 \|.*\| {re.escape(ar)} \[", text)
+    assert "| wins |" in text and str(place) not in text
+    kept = mine[1]["all_frames"]["sized"]
+    cells = " | ".join(f"{100 * kept[name]:.1f}" for name in ("size_2", "size_5", "size_10"))
+    assert "size to 10 % |" in text and f"| {cells} |" in text
+    page = (place / "page" / "accuracy.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 6 and page.count("<svg") == 5
+    assert "http" not in page and "<script" not in page and str(place) not in page
+
+
+def test_the_page_shows_the_model_where_the_estimate_is(place, whole):
+    from benchmarks.results_page import Study, cut, draw_models, read_run, square_around
+
+    run = read_run(place / "whole")
+    study = Study("balls", place / "balls", None, [run])
+    from ipjax.bop.dataset import Dataset, read_results
+
+    rows = {
+        (r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next((place / "whole").glob("*-test.csv")))
+    }
+    found = [i for i in run["instances"] if i["found"]][:2]
+    dataset = Dataset(place / "balls")
+    for one, picture in zip(found, draw_models(study, found, rows), strict=True):
+        mask = dataset.mask(one["scene_id"], one["im_id"], 0)
+        drawn = picture.any(-1)
+        assert (drawn & mask).sum() > 0.7 * (drawn | mask).sum()
+    shape = np.zeros((20, 30), bool)
+    shape[0:4, 20:29] = True
+    top, left, side = square_around(shape)
+    inside = cut(shape, (top, left, side))
+    assert inside.shape == (side, side) and inside.sum() == shape.sum()

@@ -1,0 +1,320 @@
+"""The law of numbers that are not numbers: they are absent, or the answer says that it is none; it is finite always."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import problems
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.numpy import save_file
+from test_object_file import make_object
+from test_pipeline import DRAWN, make_sized_query, two_objects
+
+import ipjax
+from ipjax.config import MatchConfig
+from ipjax.estimation.features import describe
+from ipjax.estimation.matching import match, select
+from ipjax.estimation.pipeline import comparable
+from ipjax.estimation.validity import finite_patches, finite_query, finite_templates
+from ipjax.files.object_file import load, save
+from ipjax.inference.frames import frame
+
+BAD = (np.nan, np.inf, -np.inf)
+KEY = jax.random.key(0)
+estimate = jax.jit(ipjax.estimate)  # compiled once for all examples, and shared with test_pipeline's cache
+described = jax.jit(describe)
+
+# What the poisoned places of each leaf mean: the mark that says "absent" in the same record, or that
+# the answer cannot be determined ("nothing"), or that the estimate does not look there ("unused").
+OF_PATCH, OF_VIEW, OF_POINT, OF_COLOURED_POINT = "patch", "view", "point", "coloured point"
+MEANING = {
+    "templates.patches.features": OF_PATCH,
+    "templates.patches.points": OF_PATCH,
+    "templates.patches.grid": OF_PATCH,
+    "templates.norm": OF_PATCH,
+    "templates.camera_from_object.rotation": OF_VIEW,
+    "templates.camera_from_object.translation": OF_VIEW,
+    "templates.camera_from_object.scale": OF_VIEW,
+    "templates.camera.focal": OF_VIEW,
+    "templates.camera.centre": OF_VIEW,
+    "templates.surface.points": OF_POINT,
+    "templates.surface.normals": OF_POINT,
+    "templates.surface.seen": OF_POINT,
+    "templates.appearance.points": OF_COLOURED_POINT,
+    "templates.appearance.normals": OF_COLOURED_POINT,
+    "templates.appearance.colours": OF_COLOURED_POINT,
+    "templates.mean": "nothing",
+    "templates.axes": "nothing",
+    "templates.seen": "unused",
+    "templates.extents": "unused",
+    "query.patches.features": "query patch",
+    "query.patches.points": "query patch",
+    "query.patches.grid": "query patch",
+    "query.view.rgb": "colour",
+    "query.view.depth": "depth",
+    "query.view.camera.focal": "nothing",
+    "query.view.camera.centre": "nothing",
+    "diameter": "nothing",
+}
+
+
+@functools.cache
+def good() -> dict[str, np.ndarray]:
+    """An object, a query of it and its size, by name; everything an estimate is made of but the encoder and the key."""
+    query, truth = make_sized_query(1, 0.12)
+    return flatten({"templates": two_objects()[0], "query": query, "diameter": truth.scale})
+
+
+def flatten(tree) -> dict[str, np.ndarray]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    return {
+        "".join(str(key) for key in path).replace("']", "").replace("['", ""): np.array(leaf) for path, leaf in leaves
+    }
+
+
+def solve(leaves: dict[str, np.ndarray]) -> ipjax.PoseEstimate:
+    query, truth = make_sized_query(1, 0.12)
+    tree = {"templates": two_objects()[0], "query": query, "diameter": truth.scale}
+    names, structure = list(flatten(tree)), jax.tree.structure(tree)
+    whole = jax.tree.unflatten(structure, [jnp.asarray(leaves[name]) for name in names])
+    return estimate(problems.make_encoder(), whole["templates"], whole["query"], KEY, DRAWN, whole["diameter"])
+
+
+def mark_absent(leaves: dict[str, np.ndarray], name: str, places: np.ndarray) -> None:
+    """Say in the record's own words that what stands at some places (rows of indices) of a leaf is not there."""
+    record = name.rpartition(".")[0]
+    rows = tuple(places.T)
+    meaning = MEANING[name]
+    if meaning == OF_PATCH:
+        leaves["templates.patches.valid"][rows[:2]] = False
+    elif meaning == OF_VIEW:
+        leaves["templates.patches.valid"][rows[0]] = False
+    elif meaning in (OF_POINT, OF_COLOURED_POINT):
+        last = "colours" if meaning == OF_COLOURED_POINT else "seen"
+        for field in ("normals", last):
+            leaves[f"{record}.{field}"][rows[0]] = 0
+        kept = np.setdiff1d(np.arange(len(leaves[name])), rows[0])[0]
+        leaves[f"{record}.points"][rows[0]] = leaves[f"{record}.points"][kept]
+    elif meaning == "query patch":
+        leaves["query.patches.valid"][rows[0]] = False
+        leaves[name][rows[0]] = 0
+    elif meaning == "colour":
+        leaves["query.view.mask"][rows[:2]] = False
+        leaves[name][rows[:2]] = 0
+    elif meaning == "depth":
+        leaves[name][rows] = 0
+
+
+def assert_finite(found: ipjax.PoseEstimate):
+    for path, leaf in jax.tree_util.tree_flatten_with_path(found)[0]:
+        assert np.isfinite(np.asarray(leaf)).all(), f"{jax.tree_util.keystr(path)} is not finite"
+
+
+def assert_says_so(found: ipjax.PoseEstimate):
+    assert not bool(found.success) and not bool(found.present) and float(found.confidence) == 0
+
+
+def test_every_leaf_has_a_meaning():
+    assert {name for name, leaf in good().items() if leaf.dtype.kind == "f"} == MEANING.keys()
+    assert bool(solve(good()).success) and float(solve(good()).confidence) > 0.5
+
+
+@given(
+    name=st.sampled_from(sorted(MEANING)), bad=st.sampled_from(BAD), count=st.integers(1, 40), seed=st.integers(0, 99)
+)
+@settings(max_examples=120)
+def test_what_is_not_finite_is_absent_or_the_answer_says_so(name, bad, count, seed):
+    """Poison random places of one leaf: the answer is the one with these places marked as absent, to the last digit."""
+    rng = np.random.default_rng(seed)
+    poisoned, marked = ({key: leaf.copy() for key, leaf in good().items()} for _ in range(2))
+    leaf = poisoned[name]
+    places = rng.choice(leaf.size, min(count, max(leaf.size // 8, 1)), replace=False)
+    leaf.reshape(-1)[places] = bad
+    found = solve(poisoned)
+    assert_finite(found)
+    if MEANING[name] == "nothing":
+        assert_says_so(found)
+        return
+    mark_absent(marked, name, np.stack(np.unravel_index(places, leaf.shape), axis=-1))
+    wanted = solve(marked)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6), found, wanted)
+
+
+HARMLESS = {"templates.seen", "templates.extents", "query.view.depth", "query.view.rgb"}
+
+
+@pytest.mark.parametrize("name", sorted(MEANING.keys() - HARMLESS))
+def test_an_answer_from_nothing_but_poison_says_so(name):
+    """A whole leaf: no patch, no point of the surface, no camera.
+
+    Without any colours to draw a pose may be found, but nobody would trust it.
+    """
+    found = solve(good() | {name: np.full_like(good()[name], np.nan)})
+    assert_finite(found)
+    assert not bool(found.present)
+    if not name.startswith("templates.appearance"):
+        assert_says_so(found)
+
+
+@pytest.mark.parametrize("name", ["query.view.depth", "query.view.rgb"])
+def test_an_image_that_is_nowhere_a_number_is_an_empty_one(name):
+    """Patches that were described before have their features and points all the same, so there may be a pose."""
+    poisoned, marked = ({key: leaf.copy() for key, leaf in good().items()} for _ in range(2))
+    poisoned[name][...] = np.nan
+    mark_absent(marked, name, np.stack(np.unravel_index(np.arange(marked[name].size), marked[name].shape), axis=-1))
+    found = solve(poisoned)
+    assert_finite(found)
+    jax.tree.map(np.testing.assert_array_equal, found, solve(marked))
+
+
+@given(place=st.integers(0, 99), bad=st.sampled_from(BAD))
+@settings(max_examples=60)
+def test_thresholds_that_are_no_numbers_are_said_so(place, bad):
+    """NaN is never meant. Infinity may be (no limit on the cycles, say); the answer is finite all the same."""
+    leaves, structure = jax.tree.flatten(DRAWN)
+    leaves[place % len(leaves)] = bad
+    query, truth = make_sized_query(1, 0.12)
+    settings = jax.tree.unflatten(structure, leaves)
+    found = estimate(problems.make_encoder(), two_objects()[0], query, KEY, settings, truth.scale)
+    assert_finite(found)
+    if np.isnan(bad):
+        assert_says_so(found)
+
+
+@given(
+    leaf=st.sampled_from(["rgb", "depth"]), bad=st.sampled_from(BAD), count=st.integers(1, 300), seed=st.integers(0, 99)
+)
+@settings(max_examples=20)
+def test_describe_leaves_out_what_is_not_finite(leaf, bad, count, seed):
+    view = problems.make_query(2)[0].view
+    image = np.array(getattr(view, leaf))
+    rows, columns = np.random.default_rng(seed).integers(0, len(image), (2, count))
+    image[rows, columns] = bad
+    found = described(problems.make_encoder(), dataclasses.replace(view, **{leaf: jnp.asarray(image)}))
+    wanted = described(problems.make_encoder(), view)
+    assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(found))
+    untouched = np.ones((8, 8), bool)
+    untouched[rows // problems.PATCH, columns // problems.PATCH] = False
+    take = lambda x: np.asarray(x)[untouched.reshape(-1)]
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(take(x), take(y)), found, wanted)
+    assert not (np.asarray(found.valid) & ~np.asarray(wanted.valid)).any()
+
+
+@pytest.mark.parametrize("field", ["focal", "centre"])
+@pytest.mark.parametrize("bad", BAD)
+def test_describe_without_a_camera_has_no_valid_patch(field, bad):
+    view = problems.make_query(2)[0].view
+    camera = dataclasses.replace(view.camera, **{field: jnp.asarray([bad, 100.0], jnp.float32)})
+    found = described(problems.make_encoder(), dataclasses.replace(view, camera=camera))
+    assert not np.asarray(found.valid).any() and np.isfinite(np.asarray(found.points)).all()
+
+
+def test_gradients_of_what_is_left_are_finite():
+    """The poison itself has none: a masked NaN must not come back through the chain rule."""
+    query, _ = make_sized_query(1, 0.12)
+    templates = two_objects()[0]
+    poison = lambda x: jnp.asarray(np.where(np.random.default_rng(0).random(x.shape) < 0.1, np.nan, x), x.dtype)
+    poisoned = jax.tree.map(lambda x: poison(x) if x.dtype.kind == "f" else x, (templates, query))
+    floats = lambda tree: [x.astype(jnp.float32) for x in jax.tree.leaves(tree) if jnp.dtype(x.dtype).kind == "f"]
+
+    def total(records):
+        known = finite_templates(records[0])[0]
+        known = dataclasses.replace(known, patches=finite_patches(known.patches))
+        return sum(jnp.sum(x**2) for x in floats((known, finite_query(records[1])[0])))
+
+    slopes = jax.jit(jax.grad(total, allow_int=True))(poisoned)
+    assert len(floats(slopes)) == len(MEANING) - 1  # all but the diameter
+    for slope, value in zip(floats(slopes), floats(poisoned), strict=True):
+        assert np.isfinite(np.asarray(slope)).all()
+        assert not np.asarray(slope)[~np.isfinite(np.asarray(value))].any()
+
+
+@pytest.mark.parametrize("centred", [True, False])
+def test_gradients_through_matches_are_those_without_the_poison(centred):
+    """Templates keep the features of patches that are not valid as they are; zero times one of them is no zero."""
+    query, _ = problems.make_query(1)
+    templates = problems.make_templates()
+    settings = dataclasses.replace(DRAWN, match=MatchConfig(views=2, pairs=64, centred=centred))
+    third = np.arange(templates.norm.shape[1]) % 3 == 0
+    put = lambda **fields: dataclasses.replace(templates, patches=dataclasses.replace(templates.patches, **fields))
+
+    def weight(patches, templates):
+        patches, known = comparable(finite_templates(templates)[0], patches, settings)
+        return jnp.sum(select(match(patches, known, settings.match), patches, known, settings.match).weight)
+
+    slopes = jax.jit(jax.grad(weight, argnums=(0, 1), allow_int=True))
+    found = slopes(query.patches, put(features=jnp.where(third[:, None], jnp.nan, templates.patches.features)))
+    wanted = slopes(query.patches, put(valid=templates.patches.valid & ~third))
+    assert np.asarray(wanted[0].features).any()
+    for told in (lambda x: x[0].features, lambda x: x[1].patches.features, lambda x: x[1].norm, lambda x: x[1].mean):
+        np.testing.assert_allclose(told(found), told(wanted), rtol=1e-5, atol=1e-6)
+
+
+def scene() -> dict:
+    """A ball before a wall."""
+    rows, columns = np.mgrid[:120, :160]
+    mask = (rows - 60) ** 2 + (columns - 80) ** 2 < 30**2
+    rgb = np.random.default_rng(0).random((120, 160, 3)).astype(np.float32)
+    depth = np.where(mask, 0.8, 1.5).astype(np.float64)
+    return {"rgb": rgb, "depth": depth, "mask": mask, "camera": np.array([[150.0, 0, 80], [0, 150.0, 60], [0, 0, 1]])}
+
+
+@given(
+    bad=st.sampled_from([*BAD, 1e300, -1.0]),
+    kind=st.sampled_from(["float16", "float32", "float64"]),
+    seed=st.integers(0, 9),
+)
+@settings(max_examples=20)
+def test_frame_takes_depth_that_is_no_number_for_unknown(bad, kind, seed):
+    given_, unknown = scene(), scene()
+    places = np.random.default_rng(seed).random((120, 160)) < 0.05
+    with np.errstate(over="ignore"):
+        given_["depth"][places] = bad
+        given_["depth"] = given_["depth"].astype(kind)
+    unknown["depth"][places] = 0
+    unknown["depth"] = unknown["depth"].astype(kind)
+    options = {"resolution": 56, "depth_scale": 1.0}
+    jax.tree.map(np.testing.assert_array_equal, frame(**given_, **options), frame(**unknown, **options))
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("place", [("rgb", (3, 4, 0)), ("camera", (0, 0)), ("camera", (1, 2))])
+def test_frame_refuses_images_and_cameras_that_are_no_numbers(place, bad):
+    name, index = place
+    arguments = scene()
+    arguments[name][index] = bad
+    with pytest.raises(ValueError, match=r"finite|positive|numbers"):
+        frame(**arguments, resolution=56)
+
+
+def poison_file(path, name: str, index, bad) -> None:
+    """What `save` refuses to write."""
+    with safe_open(path, framework="numpy") as file:
+        metadata, keys = file.metadata(), file.keys()
+        tensors = {key: file.get_tensor(key) for key in keys}
+    tensors[name][index] = bad
+    save_file(tensors, path, metadata=metadata)
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("name", ["features", "points", "grid", "norm"])
+def test_load_leaves_out_patches_that_are_no_numbers(tmp_path, name, bad):
+    templates, info = make_object()
+    path = save(tmp_path / "mug.ipjax", templates, info)
+    poison_file(path, name, (2, 1), bad)
+    wanted = np.array(templates.patches.valid)
+    wanted[2, 1] = False
+    np.testing.assert_array_equal(load(path)[0].patches.valid, wanted)
+
+
+@pytest.mark.parametrize("name", ["mean", "axes", "rotation", "focal", "extents"])
+def test_load_refuses_an_object_that_is_no_numbers(tmp_path, name):
+    path = save(tmp_path / "mug.ipjax", *make_object())
+    poison_file(path, name, 0, np.nan)
+    with pytest.raises(ValueError, match=f"damaged: {name} has values that are not finite"):
+        load(path)
