@@ -403,7 +403,8 @@ def information(
 
 def retract(start: Similarity, step: Float[Array, "n"]) -> Similarity:
     """Move by a tangent vector (rotation in rad, translation in diameters, log scale) about the object's centre."""
-    rotation = rotation_from_vector(step[:3]) @ start.rotation
+    # GPUs would round the factors to ten bits, and steps add up: the product would be no rotation.
+    rotation = jnp.matmul(rotation_from_vector(step[:3]), start.rotation, precision="highest")
     translation = start.translation + start.scale * step[3:6]
     scale = start.scale * jnp.exp(step[6]) if step.shape[0] == 7 else start.scale
     return Similarity(rotation, translation, scale)

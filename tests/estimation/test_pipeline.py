@@ -162,6 +162,29 @@ def test_the_graph_has_no_callback_and_no_lapack(templates):
     assert text.count("stablehlo") > 100  # it is the graph that was searched
 
 
+def list_products(jaxpr):
+    """Every matrix product and convolution of a graph, those in its loops and branches too."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name in ("dot_general", "conv_general_dilated"):
+            yield equation
+        for value in equation.params.values():
+            for part in value if isinstance(value, (list, tuple)) else [value]:
+                inner = getattr(part, "jaxpr", part)
+                if hasattr(inner, "eqns"):
+                    yield from list_products(inner)
+
+
+@pytest.mark.parametrize("config", [TURNED, DRAWN, ipjax.Config.paper()], ids=["turned", "drawn", "paper"])
+def test_no_product_is_left_to_the_devices_precision(templates, config):
+    """GPUs round the factors of float32 products to ten bits unless they are told otherwise."""
+    templates = dataclasses.replace(templates, appearance=problems.make_appearance(64))
+    query, _ = problems.make_query(0)
+    arguments = problems.make_encoder(), templates, query, jax.random.key(0), config
+    found = list(list_products(jax.make_jaxpr(ipjax.estimate)(*arguments).jaxpr))
+    left = [str(product) for product in found if product.params["precision"] != (jax.lax.Precision.HIGHEST,) * 2]
+    assert len(found) > 2 and not left, left
+
+
 def test_scaling_the_object_scales_nothing_but_the_scale(templates):
     """Model units cancel: templates of half the size give twice the scale and the same pose."""
     query, _ = problems.make_query(8)
