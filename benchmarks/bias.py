@@ -20,14 +20,12 @@ import ipjax
 from benchmarks.measure import describe_device
 from ipjax.config import Config
 from ipjax.estimation.features import observe
-from ipjax.estimation.pipeline import _Scene as Scene
+from ipjax.estimation.pipeline import SceneGrid
 from ipjax.estimation.refinement import refine
 from ipjax.files.storage import write_text
 from ipjax.inference.frames import frame_turned
 from ipjax.inference.reports import Plain, compose, invert
-
-sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
-import problems
+from ipjax.synthetic import problems
 
 GRID, RESOLUTION = 16, 16 * problems.PATCH  # patches and pixels on a side, as DINOv2 has them by default
 SIZES = ((640, 480), (641, 479), (1280, 720), (2560, 1440), (2561, 1441), (4096, 3072))
@@ -126,7 +124,7 @@ def measure_poses(scenes: int, directions: int, rolls: int) -> list[str]:
     templates = eqx.tree_at(lambda t: t.surface, templates, problems.make_surface(2048))
     encoder, config = problems.make_encoder(), Config()
     look = jax.jit(observe)
-    reduce = jax.jit(lambda query: Scene(query, config.score.resolution, config.refine.silhouette).cloud)
+    reduce = jax.jit(lambda query: SceneGrid(query, config.score.resolution, config.refine.silhouette).cloud)
     fit = jax.jit(lambda cloud, pose: refine(templates.surface, cloud, pose, config.refine)[0])
     find = jax.jit(ipjax.estimate)
     errors: dict[str, list[np.ndarray]] = {"contour": [], "refine, from the truth": [], "estimate": []}

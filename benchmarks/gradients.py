@@ -6,8 +6,6 @@ many changes, with its standard error; everything in float64.
 """
 
 import argparse
-import sys
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -16,9 +14,7 @@ import numpy as np
 
 import ipjax
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
-
-sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
-import problems
+from ipjax.synthetic import problems
 
 CONFIG = Config(
     match=MatchConfig(views=2, pairs=64),

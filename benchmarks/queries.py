@@ -5,9 +5,7 @@ that count are those of the tests' encoder; DINOv2's are computed and added with
 """
 
 import dataclasses
-import sys
 from functools import partial
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -20,9 +18,7 @@ from ipjax.estimation.features import describe
 from ipjax.estimation.pipeline import estimate
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.records import Query
-
-sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
-import problems
+from ipjax.synthetic import problems
 
 BLOCK = 8  # whose features are the default
 PRESET = "vits14"

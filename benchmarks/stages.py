@@ -1,6 +1,5 @@
 """The whole estimate and its stages: 400 templates of an ellipsoid, one query and batches of them. No encoder."""
 
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -12,14 +11,11 @@ from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from ipjax.config import Config, MatchConfig
 from ipjax.estimation.alignment import align
 from ipjax.estimation.matching import match, select
-from ipjax.estimation.pipeline import _Scene as Scene
-from ipjax.estimation.pipeline import apparent_diameter, comparable, estimate
+from ipjax.estimation.pipeline import SceneGrid, apparent_diameter, comparable, estimate
 from ipjax.estimation.refinement import refine
 from ipjax.estimation.scoring import score
 from ipjax.files.object_file import compact
-
-sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
-import problems
+from ipjax.synthetic import problems
 
 BATCHES = (8,)  # queries at once
 ACCELERATOR_BATCHES = (16, 64)
@@ -105,13 +101,13 @@ def hypotheses(templates, query, key):
 
 def refine_all(templates, query, poses, config):
     """Every hypothesis fitted to the depth."""
-    cloud = Scene(query, config.score.resolution, config.refine.silhouette).cloud
+    cloud = SceneGrid(query, config.score.resolution, config.refine.silhouette).cloud
     return jax.vmap(lambda pose: refine(templates.surface, cloud, pose, config.refine)[0])(poses)
 
 
 def score_all(templates, query, poses, config):
     """Every hypothesis compared with the depth and the features."""
-    scene = Scene(query, config.score.resolution, config.refine.silhouette)
+    scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
     rate = lambda pose: score(None, templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score)
     return jax.vmap(rate)(poses)
 

@@ -106,9 +106,9 @@ def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 1
     import jax.numpy as jnp
     import trimesh
     from PIL import Image
-    from problems import AXES, random_rotation, see
 
     from ipjax.records import Similarity
+    from ipjax.synthetic.problems import AXES, random_rotation, see
 
     size = 200.0  # mm
     ball = trimesh.creation.icosphere(subdivisions=4)

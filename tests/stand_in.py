@@ -8,11 +8,11 @@ import sys
 import time
 
 import equinox as eqx
-from problems import CoordinateEncoder, make_encoder
 
 import ipjax.cli
 from benchmarks import evaluation
 from ipjax.bop import run as studies
+from ipjax.synthetic.problems import CoordinateEncoder, make_encoder
 
 
 class Named(CoordinateEncoder):

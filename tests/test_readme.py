@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jax
 import numpy as np
-import problems
 import pytest
 import test_pipeline
 
@@ -15,6 +14,7 @@ import ipjax
 from ipjax.files.meshes.mesh import save_mesh
 from ipjax.files.weights.encoders import WeightsError, resolve
 from ipjax.onboarding import mesh as onboarding
+from ipjax.synthetic import problems
 from ipjax.synthetic.scenes import PERFECT, make_object, make_scene
 
 README = Path(__file__).resolve().parent.parent / "README.md"

@@ -75,7 +75,7 @@ def estimate(
         poses, agreed, _, determined = align(pairs, size, key, config.align, diameter)
         determined = determined & meant
     scale_known = diameter is not None
-    scene = _Scene(query, config.score.resolution, config.refine.silhouette)
+    scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
     unknown = jnp.zeros_like(agreed)
     unknown = Agreement(unknown, unknown, unknown, unknown, unknown, unknown)
     found = _Candidates(poses, determined, jnp.where(determined, agreed, -1), unknown)
@@ -126,7 +126,7 @@ class _Candidates(eqx.Module):
 
 
 def _settle_best(
-    templates: Templates, scene: "_Scene", found: _Candidates, pairs: Pairs, config: Config, *, scale_known: bool
+    templates: Templates, scene: "SceneGrid", found: _Candidates, pairs: Pairs, config: Config, *, scale_known: bool
 ) -> _Candidates:
     """The same, the first of them refined once more, for a mesh that may be wrong; the pairs are those of all views."""
     held = jax.tree.map(lambda x: x[:, : config.refine.pairs].reshape(-1, *x.shape[2:]), pairs)
@@ -139,7 +139,7 @@ def _settle_best(
 
 def _certainty(
     templates: Templates,
-    scene: "_Scene",
+    scene: "SceneGrid",
     found: _Candidates,
     pairs: Pairs,
     used: Bool[Array, "k"],
@@ -208,7 +208,7 @@ def _check_encoders(encoder: object, templates: Templates, query: Query) -> None
         )
 
 
-class _Scene(eqx.Module):
+class SceneGrid(eqx.Module):
     """The crop on a coarse grid: what refinement fits and what scores compare with."""
 
     cloud: Cloud
@@ -242,7 +242,7 @@ def _extent(mask: Bool[Array, "h w"], depth: Float[Array, "h w"], camera: Camera
 
 
 def _rounds(
-    templates: Templates, query: Query, scene: _Scene, first: _Candidates, config: Config, *, scale_known: bool
+    templates: Templates, query: Query, scene: SceneGrid, first: _Candidates, config: Config, *, scale_known: bool
 ) -> _Candidates:
     """Refine and score the hypotheses; then do the same with the best of them turned about the box's axes.
 
@@ -281,7 +281,7 @@ def _rounds(
 
 
 def _rate(
-    templates: Templates, query: Query, scene: _Scene, poses: Similarity, config: Config
+    templates: Templates, query: Query, scene: SceneGrid, poses: Similarity, config: Config
 ) -> tuple[Float[Array, "h"], Agreement]:
     with jax.named_scope("score"):
         rate = lambda pose: score(
@@ -294,7 +294,7 @@ def _draw_best(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
     templates: Templates,
     query: Query,
-    scene: _Scene,
+    scene: SceneGrid,
     found: _Candidates,
     config: Config,
 ) -> _Candidates:

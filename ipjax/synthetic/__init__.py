@@ -1,1 +1,1 @@
-"""Made objects, scenes and damage: what the demo, the tests and the benchmarks are fed."""
+"""Made objects, scenes, damage and problems with known answers: what the demo, the tests and benchmarks are fed."""

@@ -3,13 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ipjax.config import AlignConfig
 from ipjax.estimation.alignment import align
 from ipjax.records import Pairs
+from ipjax.synthetic import problems
 
 CONFIG = AlignConfig(count=512, keep=1, threshold=0.04, scale_gate=(0.0, float("inf")))
 VIEWS, COUNT = 2, 64

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -14,6 +13,7 @@ from ipjax.config import ConfidenceConfig
 from ipjax.estimation.confidence import covariance, find_rival, loosest_turn, pair_information, probability
 from ipjax.estimation.refinement import retract, rotation_from_vector
 from ipjax.records import Agreement, Pairs, Similarity
+from ipjax.synthetic import problems
 
 SURE = Agreement(*(jnp.asarray(x, jnp.float32) for x in (0.95, 0.9, 0.9, 0.8, 1.0, 0.1)))
 CONFIG = ConfidenceConfig()

@@ -8,7 +8,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,6 +20,7 @@ from ipjax.estimation.features import lift
 from ipjax.estimation.refinement import Cloud, refine, retract, rotation_from_vector, settle, trace_contour
 from ipjax.metrics import turn_angle
 from ipjax.records import Camera, Pairs, Similarity
+from ipjax.synthetic import problems
 
 GRID = 28
 

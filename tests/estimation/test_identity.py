@@ -5,7 +5,6 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import problems
 import pytest
 from flax import nnx
 from test_pipeline import TINY
@@ -16,6 +15,7 @@ from ipjax.files.weights.encoders import abstract_model
 from ipjax.inference.exporting import to_dictionary
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder
 from ipjax.records import Query
+from ipjax.synthetic import problems
 from ipjax.synthetic.scenes import make_object
 
 PLAIN = problems.make_encoder()

@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from conftest import GOLDEN
 from hypothesis import given, settings
@@ -15,6 +14,7 @@ from ipjax.estimation.matching import match, resemblance, select
 from ipjax.files.object_file import compact
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Camera, Patches, Similarity, Surface, Templates
+from ipjax.synthetic import problems
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,6 +16,7 @@ from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreCo
 from ipjax.estimation.features import cut, principal_basis
 from ipjax.estimation.pipeline import comparable, distinct
 from ipjax.records import Query, Similarity
+from ipjax.synthetic import problems
 
 TINY = Config(
     match=MatchConfig(views=2, pairs=64),

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from benchmarks.bias import contour_errors, pose_errors, summary
 from ipjax.config import RefineConfig
 from ipjax.estimation.features import observe
-from ipjax.estimation.pipeline import _Scene as Scene
+from ipjax.estimation.pipeline import SceneGrid
 from ipjax.estimation.refinement import (
     Cloud,
     _linearise,
@@ -28,6 +27,7 @@ from ipjax.estimation.refinement import (
 )
 from ipjax.inference.frames import frame
 from ipjax.records import Pairs
+from ipjax.synthetic import problems
 
 GRID = 56  # as the defaults have it
 CONFIG = RefineConfig(steps=15, points=256)
@@ -46,7 +46,7 @@ def scene():
 @jax.jit
 def reduced(query) -> Cloud:
     """The query on the grid, as the pipeline makes it."""
-    return Scene(query, GRID, 96).cloud
+    return SceneGrid(query, GRID, 96).cloud
 
 
 def test_the_border_and_the_fit_are_off_to_no_side():

@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -25,6 +24,7 @@ from ipjax.estimation.scoring import (
     seen_share,
 )
 from ipjax.records import Camera
+from ipjax.synthetic import problems
 
 CONFIG = ScoreConfig()
 depth_score = jax.jit(depth_agreement)

@@ -6,7 +6,6 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
-import problems
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -23,6 +22,7 @@ from ipjax.estimation.pipeline import comparable
 from ipjax.estimation.validity import finite_patches, finite_query, finite_templates
 from ipjax.files.object_file import load, save
 from ipjax.inference.frames import frame
+from ipjax.synthetic import problems
 
 BAD = (np.nan, np.inf, -np.inf)
 KEY = jax.random.key(0)

@@ -5,13 +5,13 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-import problems
 from estimates import make_estimate
 
 from ipjax.files.object_file import ObjectInfo, compact
 from ipjax.inference.estimator import MULTIPLE, Estimator, _turn
 from ipjax.inference.exporting import blank_query
 from ipjax.records import Patches, Query, Similarity
+from ipjax.synthetic import problems
 
 
 def test_pose_alternatives_and_covariance_turn_together():

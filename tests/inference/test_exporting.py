@@ -8,12 +8,12 @@ from importlib.metadata import version
 
 import jax
 import numpy as np
-import problems
 import pytest
 from test_pipeline import TINY
 
 import ipjax
 from ipjax.inference.exporting import blank_query, export, to_dictionary
+from ipjax.synthetic import problems
 
 RUN = """
 import sys, numpy as np, jax
