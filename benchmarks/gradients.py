@@ -15,6 +15,7 @@ import numpy as np
 import ipjax
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
 from ipjax.synthetic import problems
+from ipjax.transforms import difference
 
 CONFIG = Config(
     match=MatchConfig(views=2, pairs=64),
@@ -59,11 +60,8 @@ def tell(amounts, templates, query, start):
         templates, query = change(name, amount, templates, query)
     found = ipjax.estimate(None, templates, query, jax.random.key(0), CONFIG)
     pose = found.camera_from_object
-    shift = (pose.translation - start.translation) / start.scale
-    turn = pose.rotation @ start.rotation.T
-    vector = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    size = jnp.log(pose.scale / start.scale)
-    return jnp.concatenate([shift, size[None], vector, found.confidence[None]]), pose
+    step = difference(start, pose)
+    return jnp.concatenate([step[3:], step[:3], found.confidence[None]]), pose
 
 
 @jax.jit

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from ipjax.inference.drawing import draw
     from ipjax.inference.frames import frame
     from ipjax.onboarding.mesh import onboard
-    from ipjax.records import Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
+    from ipjax.records import Camera, Patches, PoseEstimate, Query, Surface, Templates, View
+    from ipjax.transforms import Similarity
 
 __version__ = "0.1.0"
 __all__ = [
@@ -77,7 +78,8 @@ _HOMES = {
     "onboarding.mesh": ("onboard",),
     "files.weights.encoders": ("load_encoder",),
     "estimation.pipeline": ("estimate",),
-    "records": ("Camera", "Patches", "PoseEstimate", "Query", "Similarity", "Surface", "Templates", "View"),
+    "records": ("Camera", "Patches", "PoseEstimate", "Query", "Surface", "Templates", "View"),
+    "transforms": ("Similarity",),
 }
 _HOME = {name: f"ipjax.{module}" for module, names in _HOMES.items() for name in names}
 

@@ -6,8 +6,9 @@ whatever was vmapped over. Frames: ``object`` is the normalised mesh (bounding-b
 """
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
+
+from ipjax.transforms import Similarity
 
 UNNAMED = "unnamed"  # the identity of an encoder that nobody named
 
@@ -17,20 +18,6 @@ class Camera(eqx.Module):
 
     focal: Float[Array, "*b 2"]  # pixels, (x, y)
     centre: Float[Array, "*b 2"]  # pixels, (x, y)
-
-
-class Similarity(eqx.Module):
-    """``x_a = scale * rotation @ x_b + translation``; name it ``a_from_b``."""
-
-    rotation: Float[Array, "*b 3 3"]
-    translation: Float[Array, "*b 3"]  # units of a
-    scale: Float[Array, "*b"]  # units of a per unit of b
-
-    def __matmul__(self, points: Float[Array, "*b n 3"]) -> Float[Array, "*b n 3"]:
-        """Map points of frame b to frame a; rows are points."""
-        # Sums of products, not a matrix product: exact in float32 on every backend, and faster for three columns.
-        moved = jnp.sum(self.rotation[..., None, :, :] * points[..., :, None, :], axis=-1)
-        return self.scale[..., None, None] * moved + self.translation[..., None, :]
 
 
 class View(eqx.Module):

@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # From the first to the last: a module imports only from rows above its own, or from its own package.
 ORDER = [
     ["ipjax_kernels"],
+    ["ipjax.transforms"],  # records are made of them
     ["ipjax.records", "ipjax.config"],
     ["ipjax.cameras"],
     ["ipjax.metrics", "ipjax.networks"],

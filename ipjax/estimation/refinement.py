@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float
 from ipjax.cameras import mostly, project
 from ipjax.config import RefineConfig
 from ipjax.records import Camera, Pairs, Similarity, Surface
+from ipjax.transforms import retract
 
 
 class Contour(eqx.Module):
@@ -399,30 +400,6 @@ def information(
     # Its terms add up to the mean square, here to the sum.
     share = _weight(config, None, zero.dtype) / values.shape[0]
     return jnp.sum(slopes[:, :, None] * slopes[:, None, :], axis=0) * share, jnp.sum(values**2) * share
-
-
-def retract(start: Similarity, step: Float[Array, "n"]) -> Similarity:
-    """Move by a tangent vector (rotation in rad, translation in diameters, log scale) about the object's centre."""
-    # GPUs would round the factors to ten bits, and steps add up: the product would be no rotation.
-    rotation = jnp.matmul(rotation_from_vector(step[:3]), start.rotation, precision="highest")
-    translation = start.translation + start.scale * step[3:6]
-    scale = start.scale * jnp.exp(step[6]) if step.shape[0] == 7 else start.scale
-    return Similarity(rotation, translation, scale)
-
-
-def rotation_from_vector(vector: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """Rodrigues' formula, with a series near zero so that it and its derivative stay finite."""
-    squared = jnp.sum(vector * vector)
-    small = squared < 1e-6
-    safe = jnp.where(small, 1.0, squared)
-    angle = jnp.sqrt(safe)
-    sine = jnp.where(small, 1 - squared / 6, jnp.sin(angle) / angle)
-    cosine = jnp.where(small, 0.5 - squared / 24, (1 - jnp.cos(angle)) / safe)
-    x, y, z = vector
-    zero = jnp.zeros_like(x)
-    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    outer = vector[:, None] * vector[None, :]
-    return jnp.eye(3, dtype=vector.dtype) * (1 - cosine * squared) + sine * cross + cosine * outer
 
 
 def _residuals(moved, unit, surface, cloud, pairs, config):

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ipjax.config import ConfidenceConfig
 from ipjax.estimation.confidence import covariance, find_rival, loosest_turn, pair_information, probability
-from ipjax.estimation.refinement import retract, rotation_from_vector
 from ipjax.records import Agreement, Pairs, Similarity
 from ipjax.synthetic import problems
+from ipjax.transforms import retract, rotation_from_vector
 
 SURE = Agreement(*(jnp.asarray(x, jnp.float32) for x in (0.95, 0.9, 0.9, 0.8, 1.0, 0.1)))
 CONFIG = ConfidenceConfig()

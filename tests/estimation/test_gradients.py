@@ -17,10 +17,11 @@ from test_pipeline import TINY, estimate
 import ipjax
 from ipjax.config import RefineConfig
 from ipjax.estimation.features import lift
-from ipjax.estimation.refinement import Cloud, refine, retract, rotation_from_vector, settle, trace_contour
+from ipjax.estimation.refinement import Cloud, refine, settle, trace_contour
 from ipjax.metrics import turn_angle
-from ipjax.records import Camera, Pairs, Similarity
+from ipjax.records import Camera, Pairs
 from ipjax.synthetic import problems
+from ipjax.transforms import difference, retract, rotation_from_vector
 
 GRID = 28
 
@@ -38,14 +39,6 @@ def look(query, shift=0.0) -> Cloud:
     valid, points = (cover > 0.3).reshape(GRID, GRID), points.reshape(GRID, GRID, 3)
     depth = jnp.where(valid, points[..., 2], 0)
     return Cloud(points, valid, camera, valid, depth, trace_contour(valid, depth, 0.03, 96))
-
-
-def tangent(pose: Similarity, start: Similarity):
-    """Coordinates of a pose near another: rotation, translation in diameters, logarithm of the size."""
-    turn = pose.rotation @ start.rotation.T
-    vector = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
-    shift = (pose.translation - start.translation) / start.scale
-    return jnp.concatenate([vector, shift, jnp.log(pose.scale / start.scale)[None]])
 
 
 # All depth is beyond the reach of losses this narrow, so that only pairs are left to fit: a cost without steps.
@@ -78,10 +71,10 @@ def test_the_minimum_moves_as_differences_say(x64):
 
     zero = jnp.zeros(3)
     best = found(zero, retract(truth, jnp.asarray(rng.normal(size=7) * 0.02)), times=30)
-    assert float(jnp.max(jnp.abs(tangent(found(zero, best), best)))) < 5e-5  # it is a minimum
-    near = lambda amounts: tangent(found(amounts, best), best)
+    assert float(jnp.max(jnp.abs(difference(best, found(zero, best))))) < 5e-5  # it is a minimum
+    near = lambda amounts: difference(best, found(amounts, best))
     forward = np.asarray(jax.jacfwd(near)(zero))
-    told = lambda amounts: tangent(found(amounts, best, times=8), best)
+    told = lambda amounts: difference(best, found(amounts, best, times=8))
     step = 5e-3
     differences = np.stack([(told(step * one) - told(-step * one)) / (2 * step) for one in np.eye(3)], axis=1)
     assert np.abs(forward).max(axis=0).min() > 1e-3  # each of them moves it

@@ -18,8 +18,6 @@ from ipjax.estimation.refinement import (
     _linearise,
     _nearest_visible,
     refine,
-    retract,
-    rotation_from_vector,
     settle,
     strained,
     trace_contour,
@@ -28,6 +26,7 @@ from ipjax.estimation.refinement import (
 from ipjax.inference.frames import frame
 from ipjax.records import Pairs
 from ipjax.synthetic import problems
+from ipjax.transforms import retract
 
 GRID = 56  # as the defaults have it
 CONFIG = RefineConfig(steps=15, points=256)
@@ -299,15 +298,6 @@ def test_what_is_hidden_does_not_count(scene, side):
     found, _ = run(surface, hide(cloud, hidden), truth, CONFIG)
     assert abs(float(found.scale / truth.scale) - 1) < 0.03
     assert float(jnp.linalg.norm(found.translation - truth.translation)) < 0.03 * float(truth.scale)
-
-
-@given(seed=st.integers(0, 2**31), power=st.integers(-8, 0))
-def test_rotations_are_rotations(seed, power):
-    vector = jnp.asarray(np.random.default_rng(seed).normal(size=3) * 10.0**power, jnp.float32)
-    matrix = np.asarray(rotation_from_vector(vector), np.float64)
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=2e-6)
-    np.testing.assert_allclose(matrix @ np.asarray(vector), vector, atol=1e-5)
-    assert bool(jnp.all(jnp.isfinite(jax.jacfwd(rotation_from_vector)(vector))))
 
 
 NEAREST = jax.jit(_nearest_visible)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from ipjax.cameras import project
 from ipjax.config import ScoreConfig
-from ipjax.estimation.refinement import retract
 from ipjax.estimation.scoring import (
     chroma_correlation,
     closeness,
@@ -25,6 +24,7 @@ from ipjax.estimation.scoring import (
 )
 from ipjax.records import Camera
 from ipjax.synthetic import problems
+from ipjax.transforms import retract
 
 CONFIG = ScoreConfig()
 depth_score = jax.jit(depth_agreement)
