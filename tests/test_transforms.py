@@ -36,7 +36,10 @@ def law(statement):
             turn *= rng.uniform(0, 0.99 * np.pi, (*shape, 1)) / np.linalg.norm(turn, axis=-1, keepdims=True)
             rest = rng.uniform(-1, 1, (*shape, 4))
             step = made((10.0**power * np.concatenate([turn, rest], axis=-1)).astype(precision))
-            return step if name == "step" else Similarity.exp(step)
+            if name == "step":
+                return step
+            pose = Similarity.exp(np.asarray(step))
+            return pose if library == "numpy" else pose.to_jax(precision)
 
         with jax.enable_x64(precision == "float64"):
             made = np.asarray if library == "numpy" else jnp.asarray
@@ -49,7 +52,7 @@ def law(statement):
                 np.testing.assert_allclose(x, y, rtol=TOLERANCE[precision], atol=TOLERANCE[precision])
 
     check.__name__, check.__doc__ = statement.__name__, statement.__doc__
-    shapes = pytest.mark.parametrize("shape", [(), (1,), (2, 3)], ids=str)
+    shapes = pytest.mark.parametrize("shape", [(), (2, 3)], ids=str)
     return pytest.mark.parametrize("kind", KINDS)(shapes(check))
 
 
@@ -181,23 +184,29 @@ def test_derivatives_are_finite_and_right(length, x64):
     """At the identity and beside it; ``log`` of ``exp`` has the identity for its derivative."""
     direction = np.array([0.6, -0.48, 0.64, 0.2, -0.1, 0.3, 0.4])
     step = jnp.asarray(length * direction)
-    there_and_back = jax.jacfwd(lambda step: Similarity.exp(step).log())(step)
-    np.testing.assert_allclose(there_and_back, np.eye(7), atol=1e-9)
-    np.testing.assert_allclose(jax.jacrev(lambda step: Similarity.exp(step).log())(step), np.eye(7), atol=1e-9)
-    pose = Similarity.exp(step)
-    for f in (lambda a: a @ a.inverse(), lambda a: a.to_matrix(), lambda a: difference(a, a), lambda a: a.log()):
-        single = jax.tree.map(lambda x: x.astype(jnp.float32), pose)
-        for slope in (*jax.tree.leaves(jax.jacrev(f)(pose)), *jax.tree.leaves(jax.jacfwd(f)(single))):
-            assert np.isfinite(slope).all()
-    second = jax.hessian(lambda step: jnp.sum(retract(pose, step).to_matrix() ** 2))(jnp.zeros(7))
-    assert np.isfinite(second).all()
+    for slopes in THERE_AND_BACK:
+        np.testing.assert_allclose(slopes(step), np.eye(7), atol=1e-9)
+    pose = Similarity.exp(np.asarray(step)).to_jax(jnp.float64)
+    for slopes in SLOPES:
+        for x in jax.tree.leaves((slopes(pose), slopes(pose.to_numpy().to_jax()))):
+            assert np.isfinite(x).all()
+    assert np.isfinite(CURVATURE(pose, jnp.zeros(7))).all()
+
+
+THERE_AND_BACK = [jax.jit(d(lambda step: Similarity.exp(step).log())) for d in (jax.jacfwd, jax.jacrev)]
+SLOPES = [
+    jax.jit(jax.jacfwd(lambda a: (a @ a.inverse(), a.to_matrix()))),
+    jax.jit(jax.jacrev(lambda a: difference(a, a))),
+    jax.jit(jax.jacrev(lambda a: a.log())),
+]
+CURVATURE = jax.jit(jax.hessian(lambda pose, step: jnp.sum(retract(pose, step).to_matrix() ** 2), argnums=1))
 
 
 def test_composing_is_differentiable_as_differences_say(x64):
     a, b, c = (jax.tree.map(lambda x: x.astype(jnp.float64), random_pose(seed)) for seed in range(3))
     points = jnp.asarray(np.random.default_rng(3).normal(size=(6, 3)))
-    told = lambda step: (retract(a, step).inverse() @ b @ retract(c, step) @ points).reshape(-1)
-    slopes = jax.jacfwd(told)(jnp.zeros(7))
+    told = jax.jit(lambda step: (retract(a, step).inverse() @ b @ retract(c, step) @ points).reshape(-1))
+    slopes = jax.jit(jax.jacfwd(told))(jnp.zeros(7))
     for k, unit in enumerate(np.eye(7)):
         np.testing.assert_allclose(slopes[:, k], (told(1e-6 * unit) - told(-1e-6 * unit)) / 2e-6, atol=1e-7)
 
