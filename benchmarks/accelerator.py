@@ -1,0 +1,452 @@
+"""``python -m benchmarks.accelerator [--page FILE] [--json FILE] [--answers FILE]``: the estimate on this device.
+
+Runs on any device; written for GPUs. Five parts, of which ``--only`` chooses:
+
+* answers: poses of problems with known answers, one query at a time and all at once, and features of DINOv2 S/14.
+  ``--answers FILE`` writes them there, or, where the file is there already, compares them with those in it: write
+  it on a CPU (``--only answers``), compare on a GPU.
+* queries: seconds of `estimate`, of one query and of many at once.
+* stages: where they go.
+* encoder: seconds of `observe` and of whole queries with DINOv2 S/14 in float32 and bfloat16.
+* neighbours: the forms of the matching kernel beside the bare product.
+
+DINOv2's weights are random unless ``--weights`` names a file. A device takes work before it has done the last: "one by
+one" waits for every answer, "in a row" only for the last.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from ipjax_kernels.neighbours import nearest
+
+from benchmarks import neighbours, stages
+from benchmarks.measure import commit, compile_fresh, describe_device, summarise
+from benchmarks.queries import BLOCK, PRESET, Both, whole
+from ipjax.config import Config
+from ipjax.estimation.features import observe
+from ipjax.estimation.pipeline import estimate
+from ipjax.files.object_file import compact
+from ipjax.files.storage import write_text
+from ipjax.files.weights.encoders import load_encoder
+from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
+
+sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
+import problems
+
+PARTS = ("answers", "queries", "stages", "encoder", "neighbours")
+BATCHES = (8, 32, 128)
+STAGED = 32  # queries at once whose stages are timed
+ANSWERS = 16
+SIZES = [(views, 256, 384, dtype) for dtype in ("float32", "bfloat16") for views in (25, 100, 400)]
+SIZES += [(400, 900, 384, "float32"), (400, 900, 384, "bfloat16")]
+NOISE = 0.3  # of the answers' features, whose norm is 1
+
+
+class Session:
+    """What the parts share: sizes, the object, and where answers are."""
+
+    def __init__(self, quick: bool, answers: Path | None, weights: str | None, trace: Path | None):
+        self.quick, self.answers, self.weights, self.trace = quick, answers, weights, trace
+        self.grid, self.channels = (8, 32) if quick else (16, 384)
+        self.seconds = 0.2 if quick else 1.0
+        self.batches = (2,) if quick else BATCHES
+        self.staged = 2 if quick else STAGED
+        templates = problems.make_templates(*((8, 1) if quick else (40, 10)), grid=self.grid, channels=self.channels)
+        narrow = templates.patches.features.astype(jnp.float16)
+        templates = eqx.tree_at(lambda t: t.patches.features, templates, narrow)
+        self.templates = compact(
+            dataclasses.replace(
+                templates,
+                surface=problems.make_surface(512 if quick else 2048),
+                appearance=problems.make_appearance(4096 if quick else 65536),
+            )
+        )
+        self.encoder = problems.make_encoder(self.channels)
+
+    def load_dinov2(self, dtype: str) -> Encoder:
+        """The encoder of the given weights, or of random ones."""
+        if self.weights:
+            return load_encoder(self.weights, dtype=dtype)
+        tiny = DinoV2Config(width=32, depth=2, heads=2, hidden=64, grid=4, dtype=dtype)
+        shape = tiny if self.quick else find_preset(PRESET, dtype)
+        return Encoder(DinoV2(shape, rngs=nnx.Rngs(0)), min(BLOCK, shape.depth - 1))
+
+    def queries(self, count: int):
+        """``count`` of them, stacked, their keys, and the truth of each."""
+        made = [problems.make_query(seed, self.grid, self.channels, noise=NOISE) for seed in range(count)]
+        queries, truth = (jax.tree.map(lambda *x: jnp.stack(x), *part) for part in zip(*made, strict=True))
+        return queries, jax.random.split(jax.random.key(0), count), truth
+
+    def repeated(self, count: int):
+        """``count`` queries, of few different ones: times need no others."""
+        queries, keys, _ = self.queries(min(count, ANSWERS))
+        resize = lambda x: jnp.resize(x, (count, *x.shape[1:]))
+        return jax.tree.map(resize, queries), keys[np.arange(count) % len(keys)]
+
+
+def answers(session: Session) -> Iterator[dict[str, Any]]:
+    """How far the poses found here are from the truth, and from those of the answers' file."""
+    queries, keys, truth = session.queries(3 if session.quick else ANSWERS)
+    arguments = session.encoder, session.templates, queries, keys, Config()
+    single, seconds, temporary = compile_fresh(
+        estimate, *(take(x, 0) if i in (2, 3) else x for i, x in enumerate(arguments))
+    )
+    print(f"  estimate compiled in {seconds:.0f} s", flush=True)
+    yield {"what": "estimate, compilation", "seconds": seconds, "temporary_bytes": temporary}
+    found = [single(session.encoder, session.templates, take(queries, i), keys[i], Config()) for i in range(len(keys))]
+    found = jax.tree.map(lambda *x: np.stack(x), *found)
+    again = single(session.encoder, session.templates, take(queries, 0), keys[0], Config())
+    same = all(np.array_equal(x[0], y) for x, y in zip(*map(jax.tree.leaves, (found, again)), strict=True))
+    yield {"what": "the same call once more", "identical": same}
+    together = jax.jit(jax.vmap(estimate, MAPPED))(*arguments)
+    poses = {"one by one": found, "all at once": together, "truth": truth}
+    poses = {name: getattr(pose, "camera_from_object", pose) for name, pose in poses.items()}
+    confidence = {"one by one": found.confidence, "all at once": together.confidence}
+    if session.answers and session.answers.exists():
+        with np.load(session.answers, allow_pickle=False) as file:
+            if "rotation" in file:
+                poses["the file's"] = dataclasses.replace(
+                    truth, **{k: file[k] for k in ("rotation", "translation", "scale")}
+                )
+                confidence["the file's"] = file["confidence"]
+                yield {"what": f"the file's answers are of {file['made']}"}
+    elif session.answers:
+        one = poses["one by one"]
+        keep(session.answers, rotation=one.rotation, translation=one.translation, scale=one.scale)
+        keep(session.answers, confidence=found.confidence)
+    for name in poses:
+        for other in ("truth", "one by one", "the file's"):
+            if other in poses and (name, other) in PAIRS:
+                yield {
+                    "what": f"{name}, from {other}",
+                    **differences(poses[name], poses[other], confidence, name, other),
+                }
+    yield from features(session, queries.view.rgb[:4])
+
+
+def features(session: Session, images) -> Iterator[dict[str, Any]]:
+    """DINOv2's features of a few images: float32 beside those of the file, and bfloat16 beside float32."""
+    encode = jax.jit(lambda encoder, images: encoder(images))
+    found = {dtype: np.asarray(encode(session.load_dinov2(dtype), images)) for dtype in ("float32", "bfloat16")}
+    if session.answers:
+        with np.load(session.answers, allow_pickle=False) as file:
+            known = file.get("features")
+        if known is None:
+            keep(session.answers, features=found["float32"])
+        else:
+            found["the file's"] = known
+    for name, other in (("float32", "the file's"), ("bfloat16", "float32")):
+        if other in found:
+            one, two = (np.asarray(found[x], np.float64) for x in (name, other))
+            error = float(np.linalg.norm(one - two) / np.linalg.norm(two))
+            least = float(np.min(np.sum(one * two, axis=-1)))
+            yield {"what": f"features in {name}, from {other}", "error": error, "least_cosine": least}
+
+
+MAPPED = (None, None, 0, 0, None)
+PAIRS = {("one by one", "truth"), ("the file's", "truth"), ("all at once", "one by one"), ("one by one", "the file's")}
+
+
+def take(tree, index: int):
+    """One of a stack."""
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def keep(path: Path, **arrays) -> None:
+    """Add arrays to a file of them, and what they were made on."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    known = dict(np.load(path, allow_pickle=False)) if path.exists() else {}
+    device = describe_device()
+    made = f"{device['device']} ({device['platform']}), jax {device['jax']}, commit {commit()}"
+    np.savez_compressed(path, **known | {name: np.asarray(x) for name, x in arrays.items()} | {"made": made})
+
+
+def differences(poses, others, confidence, name, other) -> dict[str, float]:
+    """Median and largest: degrees, up to the ellipsoid's half-turns, and place and size in % of the size."""
+    one, two = (np.asarray(x.rotation, np.float64) for x in (poses, others))
+    turns = [np.diag(s) for s in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
+    # By the chord, which is accurate for small angles, where the trace is not.
+    chords = np.min([np.linalg.norm(one @ t - two, axis=(1, 2)) for t in turns], axis=0)
+    angle = np.degrees(2 * np.arcsin(np.clip(chords / 8**0.5, 0, 1)))
+    scale = np.asarray(others.scale, np.float64)
+    place = 100 * np.linalg.norm(np.asarray(poses.translation, np.float64) - others.translation, axis=1) / scale
+    size = 100 * np.abs(np.asarray(poses.scale) / scale - 1)
+    found = {}
+    for kind, values in {"rotation_deg": angle, "place_percent": place, "size_percent": size}.items():
+        found |= {f"{kind}_median": float(np.median(values)), f"{kind}_most": float(np.max(values))}
+    if name in confidence and other in confidence:
+        found["confidence_most"] = float(np.max(np.abs(np.asarray(confidence[name]) - confidence[other])))
+    return found
+
+
+def queries(session: Session) -> Iterator[dict[str, Any]]:
+    """Estimates of one query and of many; without an encoder nothing is drawn."""
+    forms = {}
+    configs = {"Config()": Config(), "Config.fast()": Config.fast(), "Config.paper()": Config.paper()}
+    for batch in (1, *session.batches):
+        for name, config in configs.items():
+            for encoder in (session.encoder, None):
+                drawn = encoder is not None
+                # One form is timed at every size, the others once alone and once in the middle.
+                if (drawn and name == "Config()") or (batch in (1, STAGED) and not (drawn and name != "Config()")):
+                    forms[name, drawn, batch] = (
+                        estimate_many(batch),
+                        (encoder, session.templates, *some(session, batch), config),
+                    )
+    built = compile_together({key: form for key, form in forms.items()})
+    for (name, drawn, batch), (compiled, seconds, temporary) in built.items():
+        arguments = forms[name, drawn, batch][1]
+        label = f"estimate, {name}{', candidates drawn' if drawn else ''}"
+        row = {"what": label, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
+        yield row | time_call(partial(compiled, *arguments), session.seconds, batch)
+        if session.trace and (name, drawn, batch) == ("Config()", True, 1):
+            with jax.profiler.trace(str(session.trace), create_perfetto_trace=True):
+                for _ in range(2):
+                    jax.block_until_ready(compiled(*arguments))
+
+
+def estimate_many(batch: int) -> Callable:
+    return estimate if batch == 1 else jax.vmap(estimate, MAPPED)
+
+
+def some(session: Session, batch: int):
+    made, keys = session.repeated(batch)
+    return (take(made, 0), keys[0]) if batch == 1 else (made, keys)
+
+
+def staged(session: Session) -> Iterator[dict[str, Any]]:
+    """The stages of `Config()`, each compiled alone; `estimate` refines and scores two rounds of hypotheses."""
+    templates, config, forms = session.templates, Config(), {}
+    poses = jax.jit(stages.hypotheses)(templates, *some(session, 1))
+    for batch in (1, session.staged):
+        made, keys = some(session, batch)
+        start = poses
+        if batch > 1:
+            start = jax.tree.map(lambda x, batch=batch: jnp.broadcast_to(x, (batch, *x.shape)), poses)
+        for name, stage, arguments in (
+            ("match", stages.match_only, (templates, made, config)),
+            ("match + select + align", stages.front, (templates, made, keys, config)),
+            ("refine, one round", stages.refine_all, (templates, made, start, config)),
+            ("score, one round", stages.score_all, (templates, made, start, config)),
+        ):
+            axes = tuple(None if x is templates or x is config else 0 for x in arguments)
+            forms[name, batch] = stage if batch == 1 else jax.vmap(stage, axes), arguments
+    for (name, batch), (compiled, seconds, temporary) in compile_together(forms).items():
+        row = {"what": name, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
+        yield row | time_call(partial(compiled, *forms[name, batch][1]), session.seconds, batch)
+
+
+def encoders(session: Session) -> Iterator[dict[str, Any]]:
+    """DINOv2 alone and in whole queries, which describe the crop and draw six candidates with it."""
+    forms = {}
+    for dtype in ("float32", "bfloat16"):
+        encoder = session.load_dinov2(dtype)
+        both = Both(session.encoder, encoder)
+        for batch in (1, session.staged):
+            made, keys = some(session, batch)
+            forms["observe", dtype, batch] = (
+                observe if batch == 1 else jax.vmap(observe, (None, 0)),
+                (encoder, made.view),
+            )
+            one = whole if batch == 1 else jax.vmap(whole, (None, None, 0, 0, None, None))
+            forms["whole query, Config()", dtype, batch] = (
+                one,
+                (both, session.templates, made.view, keys, Config(), None),
+            )
+    for (name, dtype, batch), (compiled, seconds, temporary) in compile_together(forms).items():
+        row = {"what": f"{name}, {dtype} encoder", "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
+        yield row | time_call(partial(compiled, *forms[name, dtype, batch][1]), session.seconds, batch)
+
+
+def searches(session: Session) -> Iterator[dict[str, Any]]:
+    """The kernel's forms; GFLOP/s count the product of all patches."""
+    for views, patches, channels, dtype in [(5, 64, 32, "bfloat16")] if session.quick else SIZES:
+        arguments = neighbours.problem(views, patches, channels)
+        forms = {
+            "one large product": partial(neighbours.large_product, dtype=dtype),
+            "nearest (xla)": partial(nearest, dtype=dtype, compact=False),
+            "nearest (xla), a third of the query's patches left out": partial(nearest, dtype=dtype),
+        }
+        if dtype == "bfloat16":
+            forms["nearest (pallas)"] = partial(nearest, dtype=dtype, implementation="pallas")
+        found, base = {}, None
+        built = compile_together({name: (form, arguments) for name, form in forms.items()})
+        for name, (compiled, seconds, temporary) in built.items():
+            call = partial(compiled, *arguments)
+            if name in ("nearest (xla)", "nearest (pallas)"):
+                found[name] = call()
+            row = {"what": name, "size": f"{views} × {patches}² × {channels}", "dtype": dtype, "compile_s": seconds}
+            row |= time_call(call, session.seconds / 4, 1) | {"temporary_bytes": temporary}
+            row["gflop_per_s"] = 2e-6 * views * patches**2 * channels / row["in_a_row_ms"]
+            base = row["in_a_row_ms"] if name == "nearest (xla)" else base
+            yield row | ({"ratio": row["in_a_row_ms"] / base} if base else {})
+        if len(found) == 2:
+            plain, fused = found.values()
+            for index, similarity in ((0, 1), (2, 3)):
+                yield {
+                    "what": f"pallas beside xla, {'to templates' if index == 0 else 'to the query'}",
+                    "size": f"{views} × {patches}² × {channels}",
+                    "dtype": dtype,
+                    "indices_differ": float(np.mean(np.asarray(plain[index] != fused[index]))),
+                    "similarity_most": float(np.max(np.abs(np.asarray(plain[similarity] - fused[similarity])))),
+                }
+
+
+def compile_together(forms: dict[Any, tuple[Callable, tuple]]) -> dict[Any, tuple[Callable, float, int]]:
+    """Every function compiled, in threads as many as there are processors; the seconds are of its own tracing and
+    compiling, beside the others'."""
+
+    def lower(function, arguments):
+        start = time.perf_counter()
+        # A function of its own: what was compiled before is found again otherwise.
+        return jax.jit(lambda *a: function(*a)).lower(*arguments), time.perf_counter() - start
+
+    def compile_one(lowered, before):
+        start = time.perf_counter()
+        compiled = lowered.compile()
+        seconds = before + time.perf_counter() - start
+        memory = compiled.memory_analysis()
+        return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        jobs = {
+            key: pool.submit(compile_one, *lower(function, arguments)) for key, (function, arguments) in forms.items()
+        }
+        return {key: job.result() for key, job in jobs.items()}
+
+
+def time_call(call: Callable[[], Any], seconds: float, batch: int) -> dict[str, float]:
+    """Milliseconds of a call that is waited for, and of each of several of which only the last is."""
+    jax.block_until_ready(call())
+    times: list[float] = []
+    begin = time.perf_counter()
+    while len(times) < 3 or (time.perf_counter() - begin < seconds and len(times) < 1000):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+    count = max(3, min(int(seconds / np.median(times)), 1000))
+    start = time.perf_counter()
+    for _ in range(count - 1):
+        call()
+    jax.block_until_ready(call())
+    each = (time.perf_counter() - start) / count
+    return summarise(times) | {"in_a_row_ms": 1e3 * each, "queries_per_s": batch / each}
+
+
+RUN = {"answers": answers, "queries": queries, "stages": staged, "encoder": encoders, "neighbours": searches}
+TITLES = {
+    "answers": "The same answers?",
+    "queries": "Estimates",
+    "stages": "Stages of `Config()`",
+    "encoder": "With DINOv2 S/14",
+    "neighbours": "Nearest neighbours",
+}
+MEGABYTES = lambda x: f"{x / 2**20:.3g} MiB"
+CELLS = {  # column → field, how it is written
+    "what": ("what", str),
+    "size": ("size", str),
+    "dtype": ("dtype", str),
+    "at once": ("batch", str),
+    "one by one": ("median_ms", lambda x: f"{x:.3g} ms"),
+    "in a row": ("in_a_row_ms", lambda x: f"{x:.3g} ms"),
+    "queries/s": ("queries_per_s", lambda x: f"{x:.3g}"),
+    "GFLOP/s": ("gflop_per_s", lambda x: f"{x:.0f}"),
+    "beside xla": ("ratio", lambda x: f"{x:.2f} ×"),
+    "indices that differ": ("indices_differ", lambda x: f"{100 * x:.2g} %"),
+    "similarities differ by": ("similarity_most", lambda x: f"{x:.1g}"),
+    "rotation, median": ("rotation_deg_median", lambda x: f"{x:.3g}°"),
+    "most": ("rotation_deg_most", lambda x: f"{x:.3g}°"),
+    "place, median": ("place_percent_median", lambda x: f"{x:.3g} %"),
+    "most ": ("place_percent_most", lambda x: f"{x:.3g} %"),
+    "size, median": ("size_percent_median", lambda x: f"{x:.3g} %"),
+    " most": ("size_percent_most", lambda x: f"{x:.3g} %"),
+    "confidence, most": ("confidence_most", lambda x: f"{x:.2g}"),
+    "identical": ("identical", lambda x: "yes" if x else "no"),
+    "error": ("error", lambda x: f"{x:.2g}"),
+    "least cosine": ("least_cosine", lambda x: f"{x:.6f}"),
+    "seconds": ("seconds", lambda x: f"{x:.3g}"),
+    "compiled": ("compile_s", lambda x: f"{x:.2g} s"),
+    "temporary": ("temporary_bytes", MEGABYTES),
+}
+
+
+def render(results: dict[str, Any]) -> str:
+    """The page: a heading that says what was measured on what, and a table for each part."""
+    lines = [
+        f"**{results['device']}** ({results['platform']}, {results['cores']} processor cores), jax {results['jax']}, "
+        f"Python {results['python']}, {results['date']}, commit {results['commit']}"
+        + (" — quick run, small sizes" if results["quick"] else ""),
+        "",
+        f"Measured by `{results['command']}`, in {results['seconds']:.0f} s. "
+        "Forms of one part were compiled in parallel; the seconds of compiling are of each beside the others. "
+        "“One by one” is the median of calls each of which is waited for, “in a row” the mean of calls of which only "
+        "the last is.",
+    ]
+    for part, rows in results["parts"].items():
+        columns = [c for c, (field, _) in CELLS.items() if any(field in row for row in rows)]
+        if part == "neighbours":
+            columns.remove("queries/s")
+        lines += ["", f"## {TITLES[part]}", "", "| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
+        for row in rows:
+            cells = [CELLS[c][1](row[CELLS[c][0]]) if CELLS[c][0] in row else "" for c in columns]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Measure, print as it goes, and write what was asked for after every part."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.accelerator",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--only", choices=PARTS, action="append", help="measure this part; may be repeated")
+    parser.add_argument("--page", type=Path, metavar="FILE", help="write a page of Markdown here")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the results here")
+    parser.add_argument("--answers", type=Path, metavar="FILE", help="write answers here, or compare with those in it")
+    parser.add_argument("--weights", help="of the encoder (default: random ones)")
+    parser.add_argument("--trace", type=Path, metavar="FOLDER", help="write a profile of two estimates here")
+    parser.add_argument("--commit", help="what to call the code where there is no git (default: ask git)")
+    parser.add_argument("--quick", action="store_true", help="small sizes, few runs: does it work?")
+    options = parser.parse_args()
+    begin = time.perf_counter()
+    only = "".join(f" --only {part}" for part in options.only or [])
+    results: dict[str, Any] = {**describe_device(), "date": time.strftime("%Y-%m-%d"), "quick": options.quick}
+    results |= {"commit": options.commit or commit(), "parts": {}}
+    results["command"] = f"python -m benchmarks.accelerator{only}" + " --answers FILE" * bool(options.answers)
+    session = Session(options.quick, options.answers, options.weights, options.trace)
+    print(
+        f"{results['device']}, jax {results['jax']}; problems made in {time.perf_counter() - begin:.0f} s", flush=True
+    )
+    for part in PARTS:
+        if part not in (options.only or PARTS):
+            continue
+        rows = results["parts"].setdefault(part, [])
+        for row in RUN[part](session):
+            rows.append(row)
+            told = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items() if k != "what"}
+            print(f"[{time.perf_counter() - begin:4.0f} s] {part}: {row['what']}: {told}", flush=True)
+        results["seconds"] = time.perf_counter() - begin
+        if options.json:
+            write_text(options.json, json.dumps(results, indent=1, ensure_ascii=False) + "\n", parents=True)
+        if options.page:
+            write_text(options.page, render(results), parents=True)
+    print("\n" + render(results))
+
+
+if __name__ == "__main__":
+    main()
