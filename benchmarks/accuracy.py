@@ -19,14 +19,15 @@ from benchmarks.measure import describe_device
 from ipjax.bop import run as studies
 from ipjax.bop.dataset import MM, Dataset, read_results
 from ipjax.bop.evaluation import Score, evaluate
-from ipjax.cli import _use_cache
+from ipjax.files.settings import read_config
 from ipjax.files.storage import write_text
 from ipjax.files.weights.encoders import load_encoder
+from ipjax.inference.compilation_cache import use_compilation_cache
 
 
 def run(dataset: Dataset, known, encoder, config: str, output: Path, *, keep: bool = False):
     """The score of one configuration, and what found it."""
-    finder = studies.Finder(known, encoder, studies.read_config(config), keep=keep)
+    finder = studies.Finder(known, encoder, read_config(config), keep=keep)
     found = evaluate(
         dataset,
         list(known),
@@ -91,7 +92,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/accuracy"))
     parser.add_argument("--json", type=Path, help="write the medians here")
     options = parser.parse_args()
-    _use_cache()
+    use_compilation_cache()
     dataset = Dataset(options.data, models=options.models)
     encoder = load_encoder(options.weights)
     print(f"encoder: {encoder.identity}")

@@ -18,9 +18,10 @@ from benchmarks.classical import Classical, import_open3d, read_bodies
 from ipjax.bop import run as studies
 from ipjax.bop.dataset import Dataset, DatasetError
 from ipjax.bop.evaluation import Score, evaluate
-from ipjax.cli import _use_cache
+from ipjax.files.settings import read_config
 from ipjax.files.storage import write_text
 from ipjax.files.weights.encoders import load_encoder
+from ipjax.inference.compilation_cache import use_compilation_cache
 
 METRICS = ("mssd", "mspd", "vsd", "add", "add_s")
 # Where a data set's own notes doubt an annotation: reported with and without.
@@ -92,7 +93,7 @@ class Study:
         if method == "classical":
             bodies = read_bodies(self.dataset, objects=self.objects, **self.meshes)
             return Classical(bodies, seed=seed), {o: b.alignment for o, b in bodies.items()}, "classical"
-        config = studies.read_config(method)
+        config = read_config(method)
         if self._finder is None:
             known = studies.prepare(
                 self.dataset,
@@ -189,8 +190,8 @@ def main(arguments: list[str] | None = None) -> None:
         planned = plan(options)
         for method in methods:
             if method != "classical":
-                studies.read_config(method)
-        _use_cache()
+                read_config(method)
+        use_compilation_cache()
         encoder = None
         if any(method != "classical" for method in methods):
             encoder = load_encoder(options.weights)

@@ -196,8 +196,8 @@ def run(
     import jax.numpy as jnp
 
     from benchmarks.measure import commit
-    from ipjax.cli import _use_cache
     from ipjax.files.weights.encoders import load_encoder
+    from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.inference.estimator import Estimator
     from ipjax.onboarding.foreground import Photo
     from ipjax.onboarding.mesh import onboard
@@ -208,7 +208,7 @@ def run(
     done = set()
     if output.exists():
         done = {tuple(json.loads(line)["key"]) for line in output.read_text().splitlines()}
-    _use_cache()
+    use_compilation_cache()
     encoder = load_encoder(weights)
     everything = Estimator([], encoder)
     scans: dict[str, tuple] = {}

@@ -248,6 +248,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
     if arguments.save_mesh is not None:
         _check_output(arguments.save_mesh, (".glb", ".obj", ".ply", ".stl"))
     from ipjax.config import OnboardConfig
+    from ipjax.inference.compilation_cache import use_compilation_cache
 
     config = OnboardConfig(
         **{k: v for k in ("directions", "rolls", "channels") if (v := getattr(arguments, k)) is not None}
@@ -274,7 +275,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
         given["tried"] = output.with_suffix(".tried.png")
         take_shot(source, **given)  # a bad photo is refused before weights are loaded and anything is compiled
         encoder = _load_encoder(arguments)
-        _use_cache()
+        use_compilation_cache()
         lrm = {"lrm": arguments.lrm or "auto", "lrm_weights": arguments.lrm_weights}
         photo = onboard_photo(source, encoder, config, **given, **lrm, **options)
         templates, info = photo.templates, photo.info
@@ -286,7 +287,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
         from ipjax.onboarding.mesh import onboard
 
         encoder = _load_encoder(arguments)
-        _use_cache()
+        use_compilation_cache()
         unit = None if arguments.unit is None else _UNITS[arguments.unit]
         templates, info = onboard(source, encoder, config, metres_per_unit=unit, **options)
     warned: tuple[str, ...] = ()
@@ -418,8 +419,10 @@ def _estimate(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.seed < 2**32:
         raise ValueError(f"--seed must be from 0 to {2**32 - 1}")
 
-    from ipjax.bop.run import read_config
     from ipjax.files.object_file import load
+    from ipjax.files.settings import read_config
+    from ipjax.files.weights.matching import load_matching_encoder
+    from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.inference.frames import frame
 
     config = read_config(arguments.config)
@@ -439,10 +442,11 @@ def _estimate(arguments: argparse.Namespace) -> int:
     objects = [load(path) for path in arguments.objects]
     if many:
         _choose_masks(frames, [info.name for _, info in objects], arguments)
-    encoder = _matching_encoder(arguments, arguments.objects, [info.encoder for _, info in objects])
+    identities = [info.encoder for _, info in objects]
+    encoder = load_matching_encoder(arguments.objects, identities, arguments.weights)
     if not arguments.quiet:
         arguments.notes.tell()
-    _use_cache()
+    use_compilation_cache()
     from ipjax.files.storage import write_text
     from ipjax.inference.drawing import draw, gather_evidence, write_image
     from ipjax.inference.estimator import Estimator
@@ -759,9 +763,11 @@ def _add_demo(commands: Any) -> None:
 def _demo(arguments: argparse.Namespace) -> int:
     if arguments.output.exists() and not arguments.output.is_dir():
         raise ValueError(f"{arguments.output}: a file of this name is in the way")
+    from ipjax.inference.compilation_cache import use_compilation_cache
+
     encoder = _load_encoder(arguments)
     arguments.notes.tell()
-    _use_cache()
+    use_compilation_cache()
     from ipjax.commands.demo import run_demo
 
     return 0 if run_demo(arguments.output, encoder, seed=arguments.seed) else 1
@@ -898,8 +904,9 @@ def _score(arguments: argparse.Namespace) -> int:
         _check_output(arguments.json, (".json",))
     from ipjax.bop.dataset import Dataset, parse_images
     from ipjax.bop.evaluation import score
+    from ipjax.inference.compilation_cache import use_compilation_cache
 
-    _use_cache()
+    use_compilation_cache()
     dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
     found = score(
         arguments.results,
@@ -986,15 +993,17 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     from ipjax.bop.dataset import Dataset, parse_images
     from ipjax.bop.evaluation import evaluate
     from ipjax.config import OnboardConfig
+    from ipjax.files.settings import read_config
+    from ipjax.inference.compilation_cache import use_compilation_cache
 
-    config = studies.read_config(arguments.config)
+    config = read_config(arguments.config)
     meshes = studies.parse_numbered(arguments.mesh, "--mesh")
     alignments = studies.parse_numbered(arguments.alignment, "--alignment")
     dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
     views = OnboardConfig(**{k: v for k in ("directions", "rolls") if (v := getattr(arguments, k)) is not None})
     encoder = _load_encoder(arguments)
     arguments.notes.tell()
-    _use_cache()
+    use_compilation_cache()
     known = studies.prepare(
         dataset,
         encoder,
@@ -1098,8 +1107,8 @@ examples:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from ipjax.bop.run import read_config
     from ipjax.files.object_file import load
+    from ipjax.files.settings import read_config
     from ipjax.inference.exporting import blank_query, export
 
     output = _check_output(arguments.output, (".stablehlo",))
@@ -1174,47 +1183,6 @@ def _load_encoder(arguments: argparse.Namespace) -> Any:
     return load_encoder(arguments.weights, block=arguments.block, dtype=dtype)
 
 
-def _matching_encoder(arguments: argparse.Namespace, paths: Sequence[Path], identities: Sequence[str]) -> Any:
-    """The encoder that made the objects, of the weights given or here; what does not fit is refused before it is built.
-
-    Raises ValueError, naming the object file, where they were made by different ones, or by one that is not here.
-    """
-    import re
-
-    from ipjax.files.weights.encoders import find_by_hash, list_weights, load_encoder
-
-    wanted = identities[0]
-    for path, identity in zip(paths, identities, strict=True):
-        if identity != wanted:
-            raise ValueError(
-                f"{path}: made with the encoder '{identity}', but {paths[0]} with '{wanted}'; onboard one of them again"
-            )
-    options: dict[str, Any] = {"dtype": "bfloat16" if " bfloat16 " in wanted else "float32"}
-    if block := re.search(r"\bblock=(\d+)\b", wanted):
-        options["block"] = int(block[1])
-    name, sum_ = arguments.weights, re.search(r"\bsha256:([0-9a-f]{64})\b", wanted)
-    if name is None and sum_ is not None:
-        name = find_by_hash(sum_[1])
-        if name is None:
-            here = ", ".join(row.name for row in list_weights() if row.path is not None)
-            raise ValueError(
-                f"{paths[0]}: made with the encoder '{wanted}', whose weights are not here "
-                f"({f'here are: {here}' if here else 'none are: see ipjax weights fetch --help'}); onboard the object "
-                "again, or give the weights it was made with"
-            )
-    encoder = load_encoder(name, **options)
-    _check_encoder(paths[0], wanted, encoder)
-    return encoder
-
-
-def _check_encoder(path: Path, wanted: str, encoder: Any) -> None:
-    if wanted != encoder.identity:
-        raise ValueError(
-            f"{path}: made with the encoder '{wanted}', but the one at hand is '{encoder.identity}'; "
-            "onboard the object again, or give the weights it was made with"
-        )
-
-
 def _check_output(path: Path, suffixes: tuple[str, ...]) -> Path:
     """Refuse before the work, not after it."""
     if path.suffix.lower() not in suffixes:
@@ -1226,28 +1194,6 @@ def _check_output(path: Path, suffixes: tuple[str, ...]) -> Path:
     if not os.access(path.parent, os.W_OK):
         raise ValueError(f"{path}: the folder {path.parent} cannot be written to")
     return path
-
-
-def _use_cache() -> None:
-    """Keep compiled programs between runs, in a folder that only this user can read; IPJAX_NO_CACHE=1 does not."""
-    if os.environ.get("IPJAX_NO_CACHE", "") not in ("", "0"):
-        return
-    import jax
-
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:  # somebody has decided already
-        return
-    base = os.environ.get("IPJAX_CACHE") or Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "ipjax"
-    folder = Path(base).expanduser() / "xla"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = folder.stat()
-        if hasattr(os, "getuid") and status.st_uid != os.getuid():
-            return  # compiled programs are code: never run another user's
-        folder.chmod(0o700)
-    except OSError:
-        return  # slower, but no reason to fail
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
 if __name__ == "__main__":

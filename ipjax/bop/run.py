@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import json
 import logging
-import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,16 +14,15 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import equinox as eqx
-
 from ipjax import __version__
 from ipjax.bop.dataset import MM, Dataset, DatasetError, Estimate, Frame, Target
 from ipjax.bop.evaluation import Alignment, read_alignment
-from ipjax.config import PRESETS, Config, OnboardConfig
+from ipjax.config import Config, OnboardConfig
 from ipjax.files.meshes.mesh import load_mesh
 from ipjax.files.object_file import FORMAT, load, save
 from ipjax.files.provenance import hash_executed
-from ipjax.files.storage import read_json, write_text
+from ipjax.files.settings import describe_config
+from ipjax.files.storage import write_text
 from ipjax.files.weights.encoders import cache_folder, hash_file
 from ipjax.inference.estimator import Estimator, Result
 from ipjax.inference.reports import compose
@@ -46,57 +44,6 @@ class Known:
     obj_id: int
     path: Path
     alignment: Alignment | None = None  # None: the mesh is the model itself, in millimetres
-
-
-def read_config(name: str | Path) -> Config:
-    """``default``, ``fast``, ``paper``, or a JSON file of what differs from the default, for instance
-    ``{"from": "paper", "match": {"views": 4}}``.
-
-    Raises ValueError, in a sentence, for a setting that does not exist or is of the wrong kind.
-    """
-    if str(name) in PRESETS:
-        return Config.named(str(name))
-    path = Path(name)
-    if not path.is_file():
-        raise ValueError(f"{name}: neither {', '.join(PRESETS)} nor a file of settings")
-    entry = read_json(path, "file of settings")
-    if not isinstance(entry, dict):
-        raise ValueError(f"{path}: settings are a JSON object, like {{'match': {{'views': 4}}}}")
-    start = entry.pop("from", "default")
-    if start not in PRESETS:
-        raise ValueError(f"{path}: 'from' is one of {', '.join(PRESETS)}, not {start!r}")
-    return _replaced(Config.named(start), entry, str(path))
-
-
-def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:
-    names = {field.name for field in dataclasses.fields(config)}
-    changed = {}
-    for name, value in entry.items():
-        if name not in names:
-            raise ValueError(f"{where}: no setting {name!r}; there are {', '.join(sorted(names))}")
-        old = getattr(config, name)
-        if isinstance(old, eqx.Module):
-            if not isinstance(value, Mapping):
-                raise ValueError(f"{where}: {name} holds settings of its own")
-            changed[name] = _replaced(old, value, f"{where}, {name}")
-        elif isinstance(old, tuple) and isinstance(value, list) and len(value) == len(old):
-            changed[name] = tuple(float(x) for x in value)
-        elif isinstance(old, float) and isinstance(value, int | float) and not isinstance(value, bool):
-            changed[name] = float(value)
-        elif type(old) is type(value):
-            changed[name] = value
-        else:
-            raise ValueError(f"{where}: {name} is {old!r} by default; {value!r} is of another kind")
-    return dataclasses.replace(config, **changed)
-
-
-def describe_config(config: Any) -> Any:
-    """A configuration as plain JSON; what is not finite as text."""
-    if isinstance(config, eqx.Module):
-        return {f.name: describe_config(getattr(config, f.name)) for f in dataclasses.fields(config)}
-    if isinstance(config, tuple):
-        return [describe_config(x) for x in config]
-    return config if not isinstance(config, float) or math.isfinite(config) else str(config)
 
 
 def prepare(

@@ -14,9 +14,9 @@ from benchmarks import ablation, calibration, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from benchmarks.photo_pairs import camera_from_true_mesh
 from benchmarks.results_page import Study
-from ipjax.bop.run import describe_config, read_config
 from ipjax.config import ConfidenceConfig, Config
 from ipjax.estimation.confidence import probability
+from ipjax.files.settings import describe_config, read_config
 from ipjax.inference.reports import Plain, compose, invert
 from ipjax.records import Agreement
 from ipjax.synthetic.degradation import degrade

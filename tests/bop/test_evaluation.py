@@ -517,42 +517,6 @@ def test_the_truth_scores_one_whatever_its_symmetries(protocol):
 # Studies: settings, and what they are made of
 
 
-def test_settings_from_a_file(tmp_path):
-    from ipjax.config import Config
-
-    path = tmp_path / "settings.json"
-    path.write_text('{"from": "paper", "match": {"views": 4, "cycle": 3}, "align": {"scale_gate": [0.1, 10]}}')
-    config = studies.read_config(path)
-    assert (config.match.views, config.match.cycle, config.align.scale_gate) == (4, 3.0, (0.1, 10.0))
-    assert config.score == Config.paper().score
-    assert studies.read_config("paper") == Config.paper() != studies.read_config("default") == Config()
-    assert studies.read_config("fast") == Config.fast() != Config()
-    with pytest.raises(ValueError, match="no settings 'slow'; there are default, fast, paper"):
-        Config.named("slow")
-    for text, says in (
-        ('{"match": {"view": 4}}', "match: no setting 'view'"),
-        ('{"match": 4}', "match holds settings of its own"),
-        ('{"match": {"views": "many"}}', "views is 8 by default"),
-        ('{"align": {"count": true}}', "of another kind"),
-        ('{"from": "nowhere"}', "'from' is one of default, fast, paper, not 'nowhere'"),
-        ("[1]", "a JSON object"),
-        ("{", "not valid JSON"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=re.escape(says)):
-            studies.read_config(path)
-    with pytest.raises(ValueError, match="neither default, fast, paper nor a file"):
-        studies.read_config("slow")
-
-
-def test_settings_are_plain_json_even_where_they_are_infinite():
-    from ipjax.config import Config
-
-    told = studies.describe_config(Config.paper())
-    assert json.loads(json.dumps(told, allow_nan=False)) == told
-    assert told["match"]["cycle"] == "inf"
-
-
 def test_the_refusal_names_the_setting(small, tmp_path):
     run(small, tmp_path, Noisy(small), settings={"config": {"match": {"views": 4, "pairs": 50}}})
     with pytest.raises(DatasetError, match=re.escape("(settings.config.match.views)")):

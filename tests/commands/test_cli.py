@@ -148,7 +148,7 @@ def run(argv) -> int:
 
 def test_another_encoders_object_file_is_refused(case, capfd, monkeypatch):
     other = SimpleNamespace(identity="dinov2 vitb14 block=8 norm=1 float32 sha256:00")
-    monkeypatch.setattr("ipjax.files.weights.encoders.load_encoder", lambda *_, **__: other)
+    monkeypatch.setattr("ipjax.files.weights.matching.load_encoder", lambda *_, **__: other)
     assert run(command(case, "--weights", case / "rgb.png")) == 2
     error = capfd.readouterr().err
     assert error.count("\n") == 1 and "onboard the object again" in error and "vitb14" in error
@@ -381,7 +381,7 @@ def found_case(tmp_path, monkeypatch):
     Image.fromarray(rgb).save(tmp_path / "scene" / "rgb" / "000002.png")  # this frame has no depth
     entry = {"cam_K": [focal, 0, centre, 0, focal, centre, 0, 0, 1], "depth_scale": 1.0}
     (tmp_path / "scene" / "scene_camera.json").write_text(json.dumps({"1": entry, "2": entry}))
-    monkeypatch.setattr("ipjax.cli._matching_encoder", lambda *_: encoder)
+    monkeypatch.setattr("ipjax.files.weights.matching.load_matching_encoder", lambda *_: encoder)
     return tmp_path, rotation, 0.3 * offset
 
 

@@ -20,10 +20,10 @@ import json, resource, sys
 from pathlib import Path
 from ipjax.bop import dataset as bop
 from ipjax.bop import evaluation
-from ipjax.bop import run as studies
 from ipjax.files.camera_files import read_camera
 from ipjax.onboarding.foreground import read_photo
 from ipjax.files.images import read_depth, read_mask, read_rgb, read_size
+from ipjax.files.settings import read_config
 
 def read_rle(path):
     return bop.decode_rle(json.loads(Path(path).read_text()))
@@ -35,7 +35,7 @@ def read_truths(path):
     return bop.Dataset(scene.parent.parent).truths(1, 0)
 
 readers = dict(rgb=read_rgb, depth=read_depth, mask=read_mask, camera=read_camera, photo=read_photo, rle=read_rle,
-               detections=bop.read_detections, settings=studies.read_config, alignment=evaluation.read_alignment,
+               detections=bop.read_detections, settings=read_config, alignment=evaluation.read_alignment,
                truths=read_truths, size=read_size)
 told = {}
 for path in sorted(Path(sys.argv[1]).iterdir()):

@@ -1,6 +1,5 @@
 """Weights: names of every scheme, hostile files, where the file comes from, and downloads from a server of our own."""
 
-import argparse
 import contextlib
 import dataclasses
 import hashlib
@@ -22,7 +21,6 @@ import pytest
 from flax import nnx
 from safetensors.numpy import save_file
 
-from ipjax import cli
 from ipjax.files.weights import encoders as weights
 from ipjax.files.weights.encoders import CATALOGUE, Source, WeightsError, fill, official_shapes, rename, resolve
 from ipjax.files.weights.onnx import read_onnx
@@ -788,10 +786,8 @@ def test_the_encoder_that_made_an_object_is_the_only_one_built(tmp_path, cache, 
         monkeypatch.setitem(weights.CATALOGUE, name, source)
         identities[name] = f"dinov2 tiny block=1 norm=1 bfloat16 sha256:{sha256}"
     monkeypatch.setattr(weights, "PREFERRED", ("first",))
-    weights_of = lambda names, given=None: cli._matching_encoder(
-        argparse.Namespace(weights=given),
-        [Path(f"{name}.ipjax") for name in names],
-        [identities[name] for name in names],
+    weights_of = lambda names, given=None: load_matching_encoder(
+        [Path(f"{name}.ipjax") for name in names], [identities[name] for name in names], given
     )
     for name in identities:
         count["fill"] = 0

@@ -1,0 +1,205 @@
+"""Configurations from names, files and words such as ``match.views=4``, checked, and back to plain JSON."""
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import equinox as eqx
+
+from ipjax.config import PRESETS, Config
+from ipjax.files.storage import read_json
+
+ConfigT = TypeVar("ConfigT", bound=eqx.Module)
+_YES, _NO = ("true", "yes", "on"), ("false", "no", "off")
+
+
+def read_config(name: str | Path, changes: Iterable[str] = ()) -> Config:
+    """``default``, ``fast``, ``paper``, or a JSON file of what differs from the default, for instance
+    ``{"from": "paper", "match": {"views": 4}}``; then ``changes`` as `override` takes them.
+
+    Raises ValueError, in a sentence, for a setting that does not exist or is of the wrong kind.
+    """
+    if str(name) in PRESETS:
+        return override(Config.named(str(name)), changes)
+    path = Path(name)
+    if not path.is_file():
+        raise ValueError(f"{name}: neither {', '.join(PRESETS)} nor a file of settings")
+    entry = read_json(path, "file of settings")
+    if not isinstance(entry, dict):
+        raise ValueError(f"{path}: settings are a JSON object, like {{'match': {{'views': 4}}}}")
+    start = entry.pop("from", "default")
+    if start not in PRESETS:
+        raise ValueError(f"{path}: 'from' is one of {', '.join(PRESETS)}, not {start!r}")
+    return override(_replaced(Config.named(start), entry, str(path)), changes)
+
+
+def override(config: ConfigT, changes: Iterable[str]) -> ConfigT:
+    """A configuration with some fields changed, each named by its path: ``match.views=4``, ``align.scale_gate=0.5,2``.
+
+    Args:
+        config: any of the configurations.
+        changes: ``FIELD=VALUE``; of two of the same field the last counts. ``true`` and ``false``, ``none`` where a
+            field may be absent, ``inf``, and commas between the numbers of a list.
+
+    Raises:
+        ValueError: there is no such field (the message names those that are spelled alike), or the value is of another
+            kind (the message says which is expected).
+    """
+    for change in changes:
+        name, equals, text = change.partition("=")
+        name, text = name.strip(), text.strip()
+        if not (name and equals and text):
+            raise ValueError(f"{change!r}: give FIELD=VALUE, for instance {_example(config)}")
+        config = _with(config, name.split("."), name, text)
+    return config
+
+
+def list_fields(config: eqx.Module, before: str = "") -> Iterator[tuple[str, Any]]:
+    """The path of every field of a configuration, such as ``match.views``, and its value."""
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if isinstance(value, eqx.Module):
+            yield from list_fields(value, f"{before}{field.name}.")
+        else:
+            yield f"{before}{field.name}", value
+
+
+def describe_config(config: Any) -> Any:
+    """A configuration as plain JSON; what is not finite as text."""
+    if isinstance(config, eqx.Module):
+        return {f.name: describe_config(getattr(config, f.name)) for f in dataclasses.fields(config)}
+    if isinstance(config, tuple):
+        return [describe_config(x) for x in config]
+    return config if not isinstance(config, float) or math.isfinite(config) else str(config)
+
+
+def _example(config: eqx.Module) -> str:
+    names = dict(list_fields(config))
+    name = "match.views" if "match.views" in names else next(iter(names))
+    return f"{name}={names[name]}"
+
+
+def _with(config: Any, path: list[str], whole: str, text: str) -> Any:
+    """The configuration with the field at the end of ``path`` replaced by what ``text`` says."""
+    known = {field.name: field for field in dataclasses.fields(config)}
+    if path[0] not in known:
+        raise ValueError(_unknown(config, path, whole))
+    old = getattr(config, path[0])
+    if isinstance(old, eqx.Module):
+        if len(path) == 1:
+            raise ValueError(f"{whole} is a group of settings: name one of them, for instance {whole}.{_example(old)}")
+        new = _with(old, path[1:], whole, text)
+    elif len(path) > 1:
+        raise ValueError(f"{whole}: {whole.removesuffix('.' + '.'.join(path[1:]))} is one value, not a group")
+    else:
+        hint = known[path[0]].type
+        new = _checked(_parsed(text, hint), hint, old, whole)
+    return dataclasses.replace(config, **{path[0]: new})
+
+
+def _unknown(config: eqx.Module, path: list[str], whole: str) -> str:
+    """What to say of a field that is not there: those near it, here or in any other group."""
+    before = whole.removesuffix(".".join(path))
+    groups = [f.name for f in dataclasses.fields(config) if isinstance(getattr(config, f.name), eqx.Module)]
+    here = [name for name, _ in list_fields(config)]
+    spelled = ".".join(path)
+    near = [name for name in here if name.rpartition(".")[2] == path[-1]]  # the right name, without its group
+    near += [name for name in difflib.get_close_matches(spelled, here, 4, 0.7) if name not in near]
+    if not near and len(path) == 1:
+        short = {name.rpartition(".")[2]: name for name in reversed(here)}
+        near = [short[name] for name in difflib.get_close_matches(spelled, short, 3, 0.7)]
+        near += difflib.get_close_matches(spelled, groups, 1, 0.7)
+    if not near:
+        near = [f.name for f in dataclasses.fields(config)]
+        return f"there is no setting {whole!r}; there are {', '.join(before + name for name in near)}"
+    return f"there is no setting {whole!r}; near it: {', '.join(before + name for name in near)}"
+
+
+def _parsed(text: str, hint: Any) -> Any:
+    """The value that a text stands for, or the text itself where it is not of that kind."""
+    kinds = _kinds(hint)
+    if type(None) in kinds and text.lower() == "none":
+        return None
+    if bool in kinds and text.lower() in (*_YES, *_NO):
+        return text.lower() in _YES
+    if any(typing.get_origin(kind) is tuple for kind in kinds):
+        return [_parsed(part.strip(), float) for part in text.strip("[]()").split(",")]
+    for kind in (int, float):
+        if kind in kinds:
+            try:
+                return kind(text)
+            except ValueError:
+                continue
+    return text
+
+
+def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:
+    known = {field.name: field for field in dataclasses.fields(config)}
+    changed = {}
+    for name, value in entry.items():
+        if name not in known:
+            raise ValueError(f"{where}: no setting {name!r}; there are {', '.join(sorted(known))}")
+        old = getattr(config, name)
+        if isinstance(old, eqx.Module):
+            if not isinstance(value, Mapping):
+                raise ValueError(f"{where}: {name} holds settings of its own")
+            changed[name] = _replaced(old, value, f"{where}, {name}")
+        else:
+            changed[name] = _checked(value, known[name].type, old, f"{where}: {name}")
+    return dataclasses.replace(config, **changed)
+
+
+def _kinds(hint: Any) -> tuple[Any, ...]:
+    """What a field may be: the members of a union, or the one type it has."""
+    return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether this is a number, or infinite as `describe_config` writes it."""
+    if value in ("inf", "-inf"):
+        return True
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300 or value in (math.inf, -math.inf)
+
+
+def _checked(value: Any, hint: Any, old: Any, where: str) -> Any:
+    """The value as the field holds it; ValueError says what the field expects."""
+    for kind in _kinds(hint):
+        if typing.get_origin(kind) is tuple:
+            if isinstance(value, list) and len(value) == len(old) and all(map(_is_number, value)):
+                return tuple(float(x) for x in value)
+        elif typing.get_origin(kind) is typing.Literal:
+            if value in typing.get_args(kind):
+                return value
+        elif kind is float:
+            if _is_number(value):
+                return float(value)
+        elif type(value) is kind:
+            return value
+    raise ValueError(
+        f"{where} is {_told(describe_config(old))} by default; {_told(value)} is of another kind: "
+        f"{_expected(hint, old)} is expected"
+    )
+
+
+def _told(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else repr(value)
+
+
+def _expected(hint: Any, old: Any) -> str:
+    names = {bool: "true or false", int: "a whole number", float: "a number", type(None): "none"}
+    told = []
+    for kind in _kinds(hint):
+        if typing.get_origin(kind) is tuple:
+            told.append(f"a list of {len(old)} numbers")
+        elif typing.get_origin(kind) is typing.Literal:
+            told.append(" or ".join(map(repr, typing.get_args(kind))))
+        else:
+            told.append(names[kind])
+    return " or ".join(told)
