@@ -13,7 +13,7 @@ from pathlib import Path
 
 from benchmarks.measure import commit, describe_device
 from benchmarks.table import render
-from ipjax.files.storage import write_text
+from ipjax.files.storage.writing import write_text
 
 
 def benchmarks():

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from benchmarks import evaluation, results_page
-from ipjax.files.storage import write_text
+from ipjax.files.storage.writing import write_text
 
 BY_DEPTH = {"ranking": "render", "power": 0.0, "alternates": 0, "drawn": 0}  # candidates compared by depth alone
 TRUSTED = {"settle": False}  # the mesh

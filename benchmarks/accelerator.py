@@ -18,7 +18,6 @@ import argparse
 import dataclasses
 import json
 import os
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -40,12 +39,10 @@ from ipjax.config import Config
 from ipjax.estimation.features import observe
 from ipjax.estimation.pipeline import estimate
 from ipjax.files.object_file import compact
-from ipjax.files.storage import write_text
+from ipjax.files.storage.writing import write_text, writing
 from ipjax.files.weights.encoders import load_encoder
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
-
-sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))  # the synthetic problems are the tests'
-import problems
+from ipjax.synthetic import problems
 
 PARTS = ("answers", "queries", "stages", "encoder", "neighbours")
 BATCHES = (8, 32, 128)
@@ -172,7 +169,8 @@ def keep(path: Path, **arrays) -> None:
     known = dict(np.load(path, allow_pickle=False)) if path.exists() else {}
     device = describe_device()
     made = f"{device['device']} ({device['platform']}), jax {device['jax']}, commit {commit()}"
-    np.savez_compressed(path, **known | {name: np.asarray(x) for name, x in arrays.items()} | {"made": made})
+    with writing(path) as temporary:
+        np.savez_compressed(temporary, **known | {name: np.asarray(x) for name, x in arrays.items()} | {"made": made})
 
 
 def differences(poses, others, confidence, name, other) -> dict[str, float]:

@@ -22,7 +22,7 @@ from ipjax.config import Config
 from ipjax.estimation.features import observe
 from ipjax.estimation.pipeline import SceneGrid
 from ipjax.estimation.refinement import refine
-from ipjax.files.storage import write_text
+from ipjax.files.storage.writing import write_text
 from ipjax.inference.frames import frame_turned
 from ipjax.inference.reports import Plain, compose, invert
 from ipjax.synthetic import problems

@@ -14,7 +14,6 @@ prints what fits best; with --page it also writes the held-out figures and the r
 
 import argparse
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +23,8 @@ from scipy import optimize, stats
 from benchmarks.measure import commit
 from benchmarks.photo_pairs import states
 from ipjax.config import ConfidenceConfig
-from ipjax.files.storage import write_text, writing
+from ipjax.files.storage.parsing import parse_json
+from ipjax.files.storage.writing import read_lines, write_text, writing
 from ipjax.records import Agreement
 
 PARTS = len(dataclasses.fields(Agreement))
@@ -35,7 +35,7 @@ RIGHT = 0.1  # of the diameter: the mean distance of surface points below which 
 
 def read(paths: list[Path]) -> list[dict]:
     """The lines of objects made in code, in the order in which they were written."""
-    rows = [json.loads(line) for path in paths for line in path.read_text().splitlines()]
+    rows = [parse_json(line) for path in paths for line in read_lines(path)]
     rows = [row for row in rows if "agreement" in row and " obj_" not in row["key"][1]]
     if any(len(row["agreement"]) != PARTS for row in rows):
         raise SystemExit("some lines are of another version, which told other parts: run benchmarks.photo_pairs again")

@@ -22,7 +22,6 @@ by default (24 × 8 instead of 40 × 10) for speed.
 import argparse
 import dataclasses
 import itertools
-import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -30,6 +29,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from ipjax.files.storage.parsing import parse_json
+from ipjax.files.storage.writing import append_json, read_lines, write_text
 
 METHODS = ("rgb", "rgbd", "scan")
 DEGRADED = ("level1", "level2", "level3", "level4")  # the true mesh made worse, for objects made in code
@@ -207,76 +209,74 @@ def run(
 
     done = set()
     if output.exists():
-        done = {tuple(json.loads(line)["key"]) for line in output.read_text().splitlines()}
+        done = {tuple(parse_json(line)["key"]) for line in read_lines(output, repair=True)}
     use_compilation_cache()
     encoder = load_encoder(weights)
     everything = Estimator([], encoder)
     scans: dict[str, tuple] = {}
     state, tried = commit(), 0
-    with output.open("a") as file:
-        for group in groups:
-            for method in methods:
-                left = len(group.queries) if limit is None else min(limit - tried, len(group.queries))
-                queries = group.queries[: max(left, 0)]
-                if method not in ("rgb", "rgbd"):
-                    queries = queries[: SCANS if group.made else 0]
-                keys = [(method, group.object, group.reference.name, query.name) for query in queries]
-                if all(key in done for key in keys):
+    for group in groups:
+        for method in methods:
+            left = len(group.queries) if limit is None else min(limit - tried, len(group.queries))
+            queries = group.queries[: max(left, 0)]
+            if method not in ("rgb", "rgbd"):
+                queries = queries[: SCANS if group.made else 0]
+            keys = [(method, group.object, group.reference.name, query.name) for query in queries]
+            if all(key in done for key in keys):
+                continue
+            start, trouble = time.perf_counter(), ""
+            ref = group.reference
+            lens = Camera(
+                focal=jnp.asarray([ref.K[0, 0], ref.K[1, 1]], jnp.float32),
+                centre=jnp.asarray([ref.K[0, 2], ref.K[1, 2]], jnp.float32),
+            )
+            made, back = None, None
+            try:
+                plain = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
+                if method == "scan":
+                    if group.object not in scans:
+                        unit = group.metres_per_unit
+                        found = onboard(plain, encoder, config, metres_per_unit=unit, progress=False)
+                        scans[group.object] = found
+                    made = scans[group.object]
+                elif method in DEGRADED:
+                    worse, back = degrade(plain, int(method[-1]))
+                    made = onboard(worse, encoder, config, progress=False)
+                else:
+                    depth = {"depth": ref.depth} if method == "rgbd" else {}
+                    photo = onboard_photo(
+                        Photo(ref.rgb),
+                        encoder,
+                        config,
+                        mask=ref.mask,
+                        camera=lens,
+                        lrm="inflate",
+                        progress=False,
+                        **depth,
+                    )
+                    made = photo.templates, photo.info
+            except ValueError as error:
+                trouble = str(error)
+            onboarding = time.perf_counter() - start
+            # One estimator for all: it compiles once for each shape of templates.
+            everything.objects = [] if made is None else [made]
+            estimator = None if made is None else everything
+            for key, query in zip(keys, queries, strict=True):
+                if key in done:
                     continue
-                start, trouble = time.perf_counter(), ""
-                ref = group.reference
-                lens = Camera(
-                    focal=jnp.asarray([ref.K[0, 0], ref.K[1, 1]], jnp.float32),
-                    centre=jnp.asarray([ref.K[0, 2], ref.K[1, 2]], jnp.float32),
-                )
-                made, back = None, None
-                try:
-                    plain = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
-                    if method == "scan":
-                        if group.object not in scans:
-                            unit = group.metres_per_unit
-                            found = onboard(plain, encoder, config, metres_per_unit=unit, progress=False)
-                            scans[group.object] = found
-                        made = scans[group.object]
-                    elif method in DEGRADED:
-                        worse, back = degrade(plain, int(method[-1]))
-                        made = onboard(worse, encoder, config, progress=False)
-                    else:
-                        depth = {"depth": ref.depth} if method == "rgbd" else {}
-                        photo = onboard_photo(
-                            Photo(ref.rgb),
-                            encoder,
-                            config,
-                            mask=ref.mask,
-                            camera=lens,
-                            lrm="inflate",
-                            progress=False,
-                            **depth,
-                        )
-                        made = photo.templates, photo.info
-                except ValueError as error:
-                    trouble = str(error)
-                onboarding = time.perf_counter() - start
-                # One estimator for all: it compiles once for each shape of templates.
-                everything.objects = [] if made is None else [made]
-                estimator = None if made is None else everything
-                for key, query in zip(keys, queries, strict=True):
-                    if key in done:
-                        continue
-                    start = time.perf_counter()
-                    row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble, "commit": state}
-                    if estimator is not None:
-                        row |= judge(group, method, estimator, query, back)
-                    row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
-                    if estimator is not None and query.other is not None:
-                        row["absent"] = look_elsewhere(estimator, query)
-                    file.write(json.dumps(row) + "\n")
-                    file.flush()
-                    told = f"ADD-S {row['add_s']:.3f}, {row['rotation']:.0f}°" if "add_s" in row else row["trouble"]
-                    print(f"{' '.join(key)} at {row['angle']:.0f}°: {told}", flush=True)
-            tried += len(group.queries)
-            if limit is not None and tried >= limit:
-                return
+                start = time.perf_counter()
+                row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble, "commit": state}
+                if estimator is not None:
+                    row |= judge(group, method, estimator, query, back)
+                row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
+                if estimator is not None and query.other is not None:
+                    row["absent"] = look_elsewhere(estimator, query)
+                append_json(output, row)
+                told = f"ADD-S {row['add_s']:.3f}, {row['rotation']:.0f}°" if "add_s" in row else row["trouble"]
+                print(f"{' '.join(key)} at {row['angle']:.0f}°: {told}", flush=True)
+        tried += len(group.queries)
+        if limit is not None and tried >= limit:
+            return
 
 
 def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -> dict:
@@ -407,7 +407,6 @@ def states(rows: list[dict]) -> str:
 def write_page(path: Path, text: str, measured: str) -> None:
     """The tables with what they rest on."""
     from benchmarks.measure import describe_device
-    from ipjax.files.storage import write_text
 
     device = describe_device()
     head = [
@@ -453,7 +452,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     if options.what == "table":
-        rows = {path: [json.loads(line) for line in path.read_text().splitlines()] for path in options.results}
+        rows = {path: [parse_json(line) for line in read_lines(path)] for path in options.results}
         text = "\n\n".join(f"## {path.stem}\n\n{table(rows[path])}" for path in options.results)
         print(text)
         if options.page:
@@ -478,7 +477,7 @@ def main() -> None:
         options.weights,
         options.methods,
     )
-    rows = [json.loads(line) for line in output.read_text().splitlines()]
+    rows = [parse_json(line) for line in read_lines(output)]
     print(f"\n{options.directions} × {options.rolls} templates; this run took {time.perf_counter() - start:.0f} s\n")
     print(table(rows))
 

@@ -10,7 +10,6 @@ import argparse
 import base64
 import dataclasses
 import html
-import json
 import math
 import time
 from pathlib import Path
@@ -20,7 +19,8 @@ import numpy as np
 
 from benchmarks.measure import commit, describe_device
 from ipjax.bop.evaluation import FEW, SIZED
-from ipjax.files.storage import write_text
+from ipjax.files.storage.parsing import parse_json, read_json
+from ipjax.files.storage.writing import read_lines, write_text
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
 HEADS = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
@@ -50,7 +50,7 @@ def read_studies(path: Path) -> list[Study]:
     """What `benchmarks.evaluation` ran."""
     if not path.is_file():
         raise SystemExit(f"{path}: no such file; run python -m benchmarks.evaluation first")
-    entries = json.loads(path.read_text(encoding="utf-8"))
+    entries = read_json(path)
     return [
         Study(e["title"], Path(e["data"]), Path(e["models"]), [read_run(Path(folder)) for folder in e["runs"]])
         for e in entries
@@ -62,9 +62,8 @@ def read_run(folder: Path) -> dict[str, Any]:
     score = folder / "score.json"
     if not score.is_file():
         raise SystemExit(f"{folder}: no score.json; let 'ipjax evaluate' finish there")
-    run = json.loads(score.read_text())
-    with open(folder / "results.jsonl", encoding="utf-8") as file:
-        run["settings"] = json.loads(file.readline())["settings"]
+    run = read_json(score)
+    run["settings"] = parse_json(read_lines(folder / "results.jsonl")[0])["settings"]
     run["folder"] = folder
     return run
 

@@ -21,7 +21,7 @@ from ipjax.config import MatchConfig
 from ipjax.estimation.features import cut, describe, object_features, principal_basis
 from ipjax.estimation.matching import match
 from ipjax.files.object_file import compact, load
-from ipjax.files.storage import write_text
+from ipjax.files.storage.writing import write_text
 from ipjax.files.weights.encoders import load_encoder
 from ipjax.inference.estimator import Estimator
 from ipjax.records import Patches, Templates

@@ -5,10 +5,10 @@ between ``<!-- benchmarks -->`` and ``<!-- /benchmarks -->`` of that file.
 """
 
 import argparse
-import json
 from pathlib import Path
 
-from ipjax.files.storage import write_text
+from ipjax.files.storage.parsing import read_json
+from ipjax.files.storage.writing import write_text
 
 BEGIN, END = "<!-- benchmarks -->", "<!-- /benchmarks -->"
 COLUMNS = {
@@ -84,7 +84,7 @@ def main():
     parser.add_argument("results", type=Path, nargs="+")
     parser.add_argument("--into", type=Path, metavar="FILE")
     options = parser.parse_args()
-    found = {path: json.loads(path.read_text()) for path in options.results}
+    found = {path: read_json(path) for path in options.results}
     if options.into is None:
         print("\n".join(render(results) for results in found.values()))
         return

@@ -447,7 +447,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
     if not arguments.quiet:
         arguments.notes.tell()
     use_compilation_cache()
-    from ipjax.files.storage import write_text
+    from ipjax.files.storage.writing import write_text
     from ipjax.inference.drawing import draw, gather_evidence, write_image
     from ipjax.inference.estimator import Estimator
     from ipjax.inference.reports import CONVENTIONS, tell_estimate, to_json
@@ -622,7 +622,7 @@ def _choose_masks(frames: list[dict[str, Any]], names: list[str], arguments: arg
 
     Raises ValueError where nothing says which mask is of which object.
     """
-    from ipjax.files.storage import read_json
+    from ipjax.files.storage.parsing import read_json
 
     folder, count = arguments.frames, len(names)
     masks = _mask_folder(folder)
@@ -1065,7 +1065,7 @@ def _degrade(arguments: argparse.Namespace) -> int:
     if arguments.alignment is not None:
         _check_output(arguments.alignment, (".json",))
     from ipjax.files.meshes.mesh import load_mesh, save_mesh
-    from ipjax.files.storage import write_text
+    from ipjax.files.storage.writing import write_text
     from ipjax.inference.reports import to_json
     from ipjax.synthetic.degradation import degrade
 

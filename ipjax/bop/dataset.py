@@ -18,7 +18,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from ipjax.files.images import BYTES_PER_PIXEL, as_mask, read_depth, read_mask, read_rgb, read_size
 from ipjax.files.meshes.mesh import Mesh, load_mesh, move
-from ipjax.files.storage import check_budget, read_json, write_text
+from ipjax.files.storage.budget import check_budget
+from ipjax.files.storage.parsing import read_json
+from ipjax.files.storage.writing import write_text
 from ipjax.metrics import SYMMETRY_STEP, discretise_symmetries
 
 MM = 1e-3  # metres

@@ -44,7 +44,9 @@ from ipjax.bop.dataset import (
     write_results,
 )
 from ipjax.files.meshes.mesh import Mesh
-from ipjax.files.storage import locked, parse_json, read_json, write_text
+from ipjax.files.storage.locks import locked
+from ipjax.files.storage.parsing import parse_json, read_json
+from ipjax.files.storage.writing import write_text
 from ipjax.progress import bar
 from ipjax.records import Camera, Similarity
 

@@ -22,8 +22,9 @@ from ipjax.files.meshes.mesh import load_mesh
 from ipjax.files.object_file import FORMAT, load, save
 from ipjax.files.provenance import hash_executed
 from ipjax.files.settings import describe_config
-from ipjax.files.storage import write_text
-from ipjax.files.weights.encoders import cache_folder, hash_file
+from ipjax.files.storage.cache import cache_folder
+from ipjax.files.storage.writing import write_text
+from ipjax.files.weights.encoders import hash_file
 from ipjax.inference.estimator import Estimator, Result
 from ipjax.inference.reports import compose
 from ipjax.networks.dinov2 import Encoder
@@ -97,7 +98,7 @@ def prepare(
         if folder is not None and obj_id in meshes:  # the file with its number is of the model
             path = folder / "meshes" / f"obj_{obj_id:06d}_{key}.ipjax"
         elif folder is None:
-            path = cache_folder().parent / "objects" / f"{source.stem}_{key}.ipjax"
+            path = cache_folder("objects") / f"{source.stem}_{key}.ipjax"
         else:
             path = there.get(obj_id, folder / f"obj_{obj_id:06d}.ipjax")
         if quality and alignment is None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ipjax.cameras import crop, resize
-from ipjax.files.storage import parse, read_text
+from ipjax.files.storage.parsing import parse, read_text
 from ipjax.records import Camera
 
 # The lens models that OpenCV can undistort, and how many coefficients they have.

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from ipjax.files.camera_files import Intrinsics, as_intrinsics, read_camera
-from ipjax.files.storage import check_budget
+from ipjax.files.storage.budget import check_budget
 
 __all__ = [
     "BYTES_PER_PIXEL",

@@ -30,7 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ipjax.estimation.features import identity_of
-from ipjax.files.storage import check_budget, parse_json, read_safetensors_header, writing
+from ipjax.files.storage.budget import check_budget, read_safetensors_header
+from ipjax.files.storage.parsing import parse_json
+from ipjax.files.storage.writing import writing
 from ipjax.records import UNNAMED, Appearance, Camera, Patches, Similarity, Surface, Templates
 
 FORMAT = 1

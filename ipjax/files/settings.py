@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 
 from ipjax.config import PRESETS, Config
-from ipjax.files.storage import read_json
+from ipjax.files.storage.parsing import read_json
 
 ConfigT = TypeVar("ConfigT", bound=eqx.Module)
 _YES, _NO = ("true", "yes", "on"), ("false", "no", "off")

@@ -4,7 +4,7 @@ import os
 
 import jax
 
-from ipjax.files.weights.encoders import cache_folder
+from ipjax.files.storage.cache import cache_folder
 
 
 def use_compilation_cache() -> None:
@@ -17,7 +17,7 @@ def use_compilation_cache() -> None:
         return
     if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:  # somebody has decided already
         return
-    folder = cache_folder().parent / "xla"
+    folder = cache_folder("xla")
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if hasattr(os, "getuid") and folder.stat().st_uid != os.getuid():

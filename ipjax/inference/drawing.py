@@ -16,7 +16,7 @@ from ipjax.estimation.matching import match
 from ipjax.estimation.pipeline import comparable
 from ipjax.files.camera_files import as_intrinsics
 from ipjax.files.object_file import ObjectInfo
-from ipjax.files.storage import writing
+from ipjax.files.storage.writing import writing
 from ipjax.inference.reports import UNSURE_TURN
 from ipjax.records import PoseEstimate, Query, Similarity, Templates
 

@@ -20,7 +20,7 @@ from jaxtyping import Array
 from ipjax import __version__
 from ipjax.config import Config
 from ipjax.estimation.pipeline import estimate
-from ipjax.files.storage import write_bytes, write_text
+from ipjax.files.storage.writing import write_bytes, write_text
 from ipjax.records import Camera, Patches, Query, Similarity, Surface, Templates, View
 
 PLATFORMS = ("cpu", "cuda", "tpu")

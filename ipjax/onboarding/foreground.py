@@ -14,7 +14,7 @@ from PIL import Image, ImageOps
 
 from ipjax.cameras import mostly, resize_pixels
 from ipjax.files.images import as_mask, get_orientation, open_image, read_size
-from ipjax.files.storage import writing
+from ipjax.files.storage.writing import writing
 
 MAX_SIDE = 2048  # pixels; larger photos are reduced
 MIN_SIDE = 16  # pixels of the object's longer side

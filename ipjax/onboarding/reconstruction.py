@@ -10,11 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ipjax.files.meshes.mesh import Mesh, make_mesh
+from ipjax.files.storage.cache import cache_folder
 from ipjax.files.weights.encoders import (
     Resolved,
     Source,
     WeightsError,
-    cache_folder,
     download_file,
     is_offline,
     recall_hash,
@@ -98,7 +98,7 @@ def resolve_triposr(
             raise WeightsError(f"there is no weights file at {path}")
         found = recall_hash(path)
         return Resolved(path, "explicit", TRIPOSR.name, TRIPOSR.preset, found, found == TRIPOSR.sha256)
-    cached = cache_folder() / TRIPOSR.file
+    cached = cache_folder("weights") / TRIPOSR.file
     if cached.is_file():
         found = recall_hash(cached)
         if found != TRIPOSR.sha256:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from ipjax.config import OnboardConfig
 from ipjax.files.meshes.mesh import Mesh, make_mesh
 from ipjax.files.object_file import ObjectInfo
-from ipjax.files.storage import write_text
+from ipjax.files.storage.writing import write_text
 from ipjax.networks.dinov2 import Encoder
 from ipjax.records import Similarity, Templates
 

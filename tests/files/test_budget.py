@@ -17,7 +17,7 @@ from test_weights import Program, field, onnx_tensor, state_dict, write_pth
 
 from ipjax.files import object_file as objects
 from ipjax.files.object_file import load, save
-from ipjax.files.storage import check_tensors, read_safetensors_header
+from ipjax.files.storage.budget import check_tensors, read_safetensors_header
 from ipjax.files.weights.encoders import read_weights
 
 MEGABYTE = 2**20

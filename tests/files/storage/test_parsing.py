@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipjax.files.storage import parse, parse_json, parse_yaml, read_json, read_text
+from ipjax.files.storage.parsing import parse, parse_json, parse_yaml, read_json, read_text
 
 
 def trees(text):
