@@ -20,7 +20,7 @@ READY = $(VENV)/.ready
 # pytest's options, e.g. make pytest PYTEST="-k umeyama"
 PYTEST ?=
 
-.PHONY: help setup demo test lint format pytest bench eval results notebooks dist clean
+.PHONY: help setup demo test lint format pytest bench docs eval results notebooks dist clean
 .DEFAULT_GOAL := help
 
 help:
@@ -31,6 +31,7 @@ help:
 	@echo "make bench      time the kernels and the pipeline on this machine"
 	@echo "make eval       accuracy on BOP data; DATA=folder in BOP layout"
 	@echo "make results    the page of results, benchmarks/results/accuracy.md and .html"
+	@echo "make docs       the pages of the API and the guides, in $(DOCS)"
 	@echo "make notebooks  execute the notebooks again and store their figures"
 	@echo "make dist       build the wheel and the source archive"
 	@echo "make clean      remove what was built, $(VENV) too"
@@ -77,6 +78,11 @@ format: $(READY)
 
 bench: $(READY)
 	$(RUN) -m benchmarks --json out/benchmarks.json
+
+# From the docstrings, README and the notebooks; the tests build them, too.
+DOCS ?= out/docs
+docs: $(READY)
+	$(RUN) tests/docs.py $(DOCS)
 
 # Objects are onboarded once, into the cache, and shared by all methods; killed and called again, it goes on.
 # WEIGHTS=file of the encoder, e.g. WEIGHTS=../shared/data/weights/dinov2_vits14_rederived_fp16.safetensors
