@@ -24,7 +24,6 @@ from ipjax.estimation.pipeline import SceneGrid
 from ipjax.estimation.refinement import refine
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.frames import frame_turned
-from ipjax.inference.reports import Plain, compose, invert
 from ipjax.synthetic import problems
 
 GRID, RESOLUTION = 16, 16 * problems.PATCH  # patches and pixels on a side, as DINOv2 has them by default
@@ -79,7 +78,7 @@ def frame_errors(
         scene.rgb, scene.depth, scene.mask, scene.matrix, resolution=resolution, crop=crop
     )
     focal, centre = np.asarray(view.camera.focal, np.float64), np.asarray(view.camera.centre, np.float64)
-    crop_from_object = Plain(*compose(invert(camera_from_crop), scene.camera_from_object))
+    crop_from_object = camera_from_crop.to_numpy().inverse() @ scene.camera_from_object.to_numpy()
     rgb, depth, mask = problems.picture(crop_from_object, focal, centre, resolution, resolution)
     zoom = scene.matrix[[0, 1], [0, 1]] / focal  # in the middle of the image
     seen = mask & (np.asarray(view.depth) > 0)

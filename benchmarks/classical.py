@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from ipjax import cameras
 from ipjax.bop import run as studies
 from ipjax.bop.dataset import MM, Dataset, Estimate, Frame, Target
 from ipjax.bop.evaluation import Alignment, evaluate, read_alignment
@@ -223,8 +224,7 @@ def unproject(frame: Frame, mask: np.ndarray | None) -> np.ndarray:
         middle = np.median(z)
         keep = np.abs(z - middle) < 5 * np.median(np.abs(z - middle)) + 0.02
         x, y, z = x[keep], y[keep], z[keep]
-    K = frame.camera
-    return np.stack([(x - K[0, 2]) * z / K[0, 0], (y - K[1, 2]) * z / K[1, 1], z], axis=-1)
+    return cameras.unproject(frame.camera, np.stack([x, y], axis=-1), z)
 
 
 def diameter(vertices: np.ndarray) -> float:

@@ -32,6 +32,7 @@ import numpy as np
 
 from ipjax.files.storage.parsing import parse_json
 from ipjax.files.storage.writing import append_json, read_lines, write_text
+from ipjax.transforms import Similarity, rotation_from_vector
 
 METHODS = ("rgb", "rgbd", "scan")
 DEGRADED = ("level1", "level2", "level3", "level4")  # the true mesh made worse, for objects made in code
@@ -51,8 +52,7 @@ class Shot:
     depth: np.ndarray  # metres
     mask: np.ndarray
     K: np.ndarray
-    rotation: np.ndarray  # camera_from_object
-    translation: np.ndarray  # metres
+    camera_from_object: Similarity[np.ndarray]  # metres from metres
     other: np.ndarray | None = None  # the mask of another object
 
 
@@ -69,9 +69,14 @@ class Group:
     made: bool = True  # tried with the true mesh, too
 
 
+def rigid(rotation: np.ndarray, translation: np.ndarray) -> Similarity[np.ndarray]:
+    """A motion that keeps the size."""
+    return Similarity(np.asarray(rotation, np.float64), np.asarray(translation, np.float64), np.ones(()))
+
+
 def view_angle(first: Shot, second: Shot) -> float:
     """Degrees between the directions from the object's origin to the two cameras; roll is no part of it."""
-    eyes = [-shot.rotation.T @ shot.translation for shot in (first, second)]
+    eyes = [shot.camera_from_object.inverse().translation for shot in (first, second)]
     cosine = eyes[0] @ eyes[1] / np.linalg.norm(eyes[0]) / np.linalg.norm(eyes[1])
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
@@ -96,7 +101,7 @@ def ycbv_groups(folder: Path, objects: tuple[int, ...] = (2, 3, 4, 5, 8, 10, 15)
         frame = dataset.frame(scene, image)
         mask = dataset.mask(scene, image, truth.index)
         name = f"{scene:06d}/{image:06d}"
-        return Shot(name, frame.rgb, frame.depth, mask, frame.camera, truth.rotation, truth.translation)
+        return Shot(name, frame.rgb, frame.depth, mask, frame.camera, rigid(truth.rotation, truth.translation))
 
     # Interleaved over objects, so that a run cut short has seen several.
     turns = [(k, number) for number in objects for k in range(len(frames[number]))]
@@ -116,12 +121,9 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
     The reference sees the object from an angle drawn evenly from each bin in turn, rolled by up to 20°; both frames
     have the noise of a cheap sensor. Objects are those made in code and, where ``data`` is, the scans there.
     """
-    import jax.numpy as jnp
-
     from ipjax.bop.dataset import Dataset
     from ipjax.bop.evaluation import Model
     from ipjax.files.meshes.mesh import normalise
-    from ipjax.records import Similarity
     from ipjax.rendering.render import render_scene
     from ipjax.synthetic.scenes import HEIGHT, KINDS, WIDTH, Sensor, _expose, _sense, make_object, make_scene
 
@@ -147,9 +149,9 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
             if scene.masks[0].sum() < 400:
                 continue
             pose = scene.camera_from_object[0]
-            rotation, translation = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation))
             mask, beside = scene.masks
-            shot = Shot(f"scene {k}", scene.rgb, scene.depth, mask, scene.matrix, rotation, translation)
+            truth = rigid(pose.rotation, pose.translation)
+            shot = Shot(f"scene {k}", scene.rgb, scene.depth, mask, scene.matrix, truth)
             told = made and k < ABSENT and beside.sum() >= 400
             queries.append(dataclasses.replace(shot, other=beside if told else None))
         if not queries:
@@ -160,27 +162,21 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
         first = queries[0]
         about = rng.uniform(0, 2 * np.pi)
         axis = np.array([np.cos(about), np.sin(about), 0.0])
-        turned = _turn(axis, angle) @ first.rotation
-        rotation = _turn(np.array([0, 0, 1.0]), np.deg2rad(rng.uniform(-20, 20))) @ turned
+        turned = rotation_from_vector(angle * axis) @ first.camera_from_object.rotation
+        rotation = rotation_from_vector(np.array([0, 0, np.deg2rad(rng.uniform(-20, 20))])) @ turned
         translation = np.array([*rng.uniform(-0.03, 0.03, 2), size * rng.uniform(3.0, 4.5)])
-        pose = Similarity(*(jnp.asarray(x, jnp.float32) for x in (rotation, translation, size)))
+        pose = Similarity(rotation, translation, np.asarray(size)).to_jax()
         light = {"direction": [*rng.normal(size=2) * 0.5, 1.0], "ambient": 0.6, "diffuse": 0.45}
         lens = scene.camera
         drawn = render_scene([(mesh, pose)], lens, HEIGHT, WIDTH, light=light)
         mask = drawn.mask[0]
         rgb = np.where(mask[..., None], drawn.rgb[0], 128).astype(np.uint8)
         depth = _sense(rng, np.where(mask, drawn.depth[0], 2.0), lens, Sensor())
-        reference = Shot("photo", _expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rotation, translation)
+        reference = Shot("photo", _expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rigid(rotation, translation))
         points = mesh.vertices[np.unique(mesh.faces)] * size
         chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
         model = Model(points[chosen], size, *none)
         yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries, made)
-
-
-def _turn(axis: np.ndarray, angle: float) -> np.ndarray:
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
@@ -195,8 +191,6 @@ def run(
     methods: Sequence[str] = METHODS,
 ) -> None:
     """Try every pair by every method; lines already in ``output`` are not tried again."""
-    import jax.numpy as jnp
-
     from benchmarks.measure import commit
     from ipjax.files.weights.encoders import load_encoder
     from ipjax.inference.compilation_cache import use_compilation_cache
@@ -226,10 +220,7 @@ def run(
                 continue
             start, trouble = time.perf_counter(), ""
             ref = group.reference
-            lens = Camera(
-                focal=jnp.asarray([ref.K[0, 0], ref.K[1, 1]], jnp.float32),
-                centre=jnp.asarray([ref.K[0, 2], ref.K[1, 2]], jnp.float32),
-            )
+            lens = Camera.from_matrix(ref.K)
             made, back = None, None
             try:
                 plain = dataclasses.replace(group.mesh, scale=1.0, centre=(0.0, 0.0, 0.0))
@@ -287,7 +278,7 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
     from scipy.spatial import KDTree
 
     from ipjax.bop.evaluation import Pose, surface_errors
-    from ipjax.inference.reports import Plain, compose, relative_pose
+    from ipjax.inference.reports import relative_pose
 
     info = estimator.objects[0][1]
     try:
@@ -301,23 +292,25 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
 
     found = estimate.camera_from_object
     if method in ("scan", *DEGRADED):
-        rotation, translation, scale = camera_from_true_mesh(found, info, back)
-        scale = scale / group.metres_per_unit  # metres per metre of the model
+        pose = camera_from_true_mesh(found, info, back)
+        scale = float(pose.scale) / group.metres_per_unit  # metres per metre of the model
+        pose = Similarity(pose.rotation, pose.translation, np.asarray(scale))
     else:
-        ref = group.reference
-        unit = 1.0 if info.measured_diameter is not None else 1 / float(ref.translation[2])
-        there = Plain(ref.rotation, unit * ref.translation, unit)
-        rotation, translation, scale = compose(Plain(*relative_pose(found, info)), there)
+        there = group.reference.camera_from_object
+        if info.measured_diameter is None:
+            unit = 1 / there.translation[2]
+            there = Similarity(there.rotation, unit * there.translation, np.asarray(unit))
+        pose = relative_pose(found, info) @ there
+        scale = float(pose.scale)
     model = group.model
-    points = model.points
-    truth = points @ query.rotation.T + query.translation
-    mine = scale * points @ rotation.T + translation
+    points, true = model.points, query.camera_from_object
+    truth, mine = true @ points, pose @ points
     nearest = KDTree(mine).query(truth)[0].mean() / model.diameter
     errors = surface_errors(
-        model, query.K[None], [Pose(query.rotation, query.translation)], [Pose(rotation, translation)]
+        model, query.K[None], [Pose(true.rotation, true.translation)], [Pose(pose.rotation, pose.translation)]
     )
-    middle = (points.min(0) + points.max(0)) / 2
-    moved = scale * rotation @ middle + translation - (query.rotation @ middle + query.translation)
+    middle = (points.min(0, keepdims=True) + points.max(0, keepdims=True)) / 2
+    moved = (pose @ middle - true @ middle)[0]
     steps = np.arange(0.05, 0.51, 0.05)
     mssd, mspd = float(errors.mssd[0]) / model.diameter, float(errors.mspd[0]) * 640 / query.rgb.shape[1]
     return {
@@ -325,25 +318,21 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
         "add": float(np.linalg.norm(mine - truth, axis=-1).mean()) / model.diameter,
         "rotation": float(np.degrees(errors.rotation[0])),
         "translation_mm": float(1e3 * np.linalg.norm(moved)),
-        "scale": float(scale),
+        "scale": scale,
         "mssd_recall": float(np.mean(mssd < steps)),
         "mspd_recall": float(np.mean(mspd < 100 * steps)),
         **certainty(estimate),
-        "surprise": surprise(rotation @ query.rotation.T, moved, np.asarray(estimate.covariance, np.float64)),
+        "surprise": surprise(pose.rotation @ true.rotation.T, moved, np.asarray(estimate.covariance, np.float64)),
         "independent": float(estimator.config.confidence.independent),
         "scale_free": info.measured_diameter is None,
         "scale_surprise": float((scale - 1) * found.scale / scale / max(float(estimate.scale_std), 1e-9)),
     }
 
 
-def camera_from_true_mesh(camera_from_object, info, back: Any = None) -> tuple[np.ndarray, np.ndarray, float]:
+def camera_from_true_mesh(camera_from_object: Similarity, info, back: Any = None) -> Similarity[np.ndarray]:
     """An estimate as the pose of the mesh that was onboarded, or of the one that this is a degraded copy of."""
-    from ipjax.inference.reports import Plain, compose, invert
-
-    camera_from_mesh = compose(camera_from_object, info.object_from_mesh)
-    if back is None:
-        return camera_from_mesh
-    return compose(Plain(*camera_from_mesh), invert(Plain(back.rotation, back.translation, back.scale)))
+    camera_from_mesh = camera_from_object.to_numpy() @ info.object_from_mesh.to_numpy()
+    return camera_from_mesh if back is None else camera_from_mesh @ back.inverse()
 
 
 def certainty(estimate) -> dict:

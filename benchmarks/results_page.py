@@ -21,6 +21,7 @@ from benchmarks.measure import commit, describe_device
 from ipjax.bop.evaluation import FEW, SIZED
 from ipjax.files.storage.parsing import parse_json, read_json
 from ipjax.files.storage.writing import read_lines, write_text
+from ipjax.transforms import Similarity
 
 COLOURS = ("#1b6ca8", "#d1495b", "#2e8b57", "#b8860b", "#6a4c93")
 HEADS = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
@@ -295,8 +296,8 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
         frame, mesh, row = dataset.frame(*place[:2]), dataset.mesh(place[2]), rows[*place, one["score"]]
         truth = next(t for t in dataset.truths(*place[:2]) if t.index == one["index"])
         shapes = [
-            silhouette(mesh.vertices @ R.T + t, mesh.faces, frame.camera, *frame.rgb.shape[:2])
-            for R, t in ((truth.rotation, truth.translation), row_pose(row))
+            silhouette(pose @ mesh.vertices, mesh.faces, frame.camera, *frame.rgb.shape[:2])
+            for pose in (row_pose(truth), row_pose(row, MM))
         ]
         box = square_around(shapes[0] | shapes[1])
         photo = resize(cut(frame.rgb, box), side)
@@ -317,17 +318,18 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
     return found
 
 
-def row_pose(row: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation and translation in metres of a line of a result file."""
-    return np.reshape(row.rotation, (3, 3)), np.asarray(row.translation) * 1e-3
+def row_pose(row: Any, unit: float = 1.0) -> Similarity[np.ndarray]:
+    """``camera_from_model`` in metres of an annotation, or of a line of a result file; ``unit``: metres in its unit."""
+    rotation = np.reshape(np.asarray(row.rotation, np.float64), (3, 3))
+    return Similarity(rotation, np.asarray(row.translation, np.float64) * unit, np.ones(()))
 
 
 def draw_models(study: Study, chosen: list[dict], rows: dict) -> list[np.ndarray]:
     """The scanned model of each target at its estimate, on black: outlines cannot tell a front from a back."""
-    import jax.numpy as jnp
+    import jax
 
-    from ipjax.bop.dataset import Dataset
-    from ipjax.records import Camera, Similarity
+    from ipjax.bop.dataset import MM, Dataset
+    from ipjax.records import Camera
     from ipjax.rendering.render import render_each
 
     dataset = Dataset(study.data, study.main["dataset"].rsplit("-", 1)[1], models=study.models)
@@ -340,18 +342,14 @@ def draw_models(study: Study, chosen: list[dict], rows: dict) -> list[np.ndarray
         poses, cameras = [], []
         for i in mine:
             one = chosen[i]
-            poses.append(row_pose(rows[one["scene_id"], one["im_id"], one["obj_id"], one["score"]]))
+            poses.append(row_pose(rows[one["scene_id"], one["im_id"], one["obj_id"], one["score"]], MM))
             cameras.append(dataset.camera(one["scene_id"], one["im_id"])[0])
         K = np.stack(cameras)
         drawn = render_each(
             [dataset.mesh(obj, "models") for obj in objects],
             [objects.index(chosen[i]["obj_id"]) for i in mine],
-            Similarity(
-                jnp.asarray(np.stack([R for R, _ in poses]), jnp.float32),
-                jnp.asarray(np.stack([t for _, t in poses]), jnp.float32),
-                jnp.ones(len(poses), jnp.float32),
-            ),
-            Camera(jnp.asarray(K[:, [0, 1], [0, 1]], jnp.float32), jnp.asarray(K[:, :2, 2], jnp.float32)),
+            jax.tree.map(lambda *x: np.stack(x), *poses).to_jax(),
+            Camera.from_matrix(K),
             height,
             width,
         )

@@ -1,8 +1,10 @@
-"""Pinhole geometry: projecting, lifting, and what cropping, resizing and subsampling an image does to its camera.
+"""Pinhole geometry: projecting, lifting, and what becomes of a camera when its image is cropped, resized, subsampled or
+turned.
 
 Pixel centres are integers (OpenCV, BOP). This is the only place that knows what follows from that: whoever changes an
-image calls :func:`crop`, :func:`resize` or :func:`subsample` for its camera (or its K), and the functions of the same
-names for pixels. Sizes and places are (x, y): width first.
+image calls :func:`crop`, :func:`resize` or :func:`subsample` for its camera, and the functions of the same names for
+pixels; whoever hands a camera to something that measures from the pixels' edges calls :func:`borders`. Sizes and places
+are (x, y): width first. A camera is a :class:`Camera` in the graph, or a 3 × 3 matrix K in NumPy on the host.
 """
 
 from typing import Any, TypeVar
@@ -13,18 +15,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ipjax.records import Camera
+from ipjax.transforms import rotation_from_vector
+
+Pinhole = TypeVar("Pinhole", Camera, np.ndarray)  # a camera in the graph, or a 3 × 3 matrix K on the host
+Pixels = TypeVar("Pixels", jax.Array, np.ndarray)
+Pair = tuple[int | float, int | float]  # (x, y)
 
 
-def project(camera: Camera, points: Float[Array, "*b n 3"]) -> Float[Array, "*b n 2"]:
+def project(camera: Pinhole, points: Float[Pixels, "*b n 3"]) -> Float[Pixels, "*b n 2"]:
     """Pixel coordinates (x, y) of points in the camera frame; points at or behind the camera stay finite."""
-    ahead = jnp.maximum(points[..., 2:], 1e-6)
-    return camera.focal[..., None, :] * points[..., :2] / ahead + camera.centre[..., None, :]
+    xp, focal, centre = _parts(camera)
+    ahead = xp.maximum(points[..., 2:], 1e-6)
+    return focal[..., None, :] * points[..., :2] / ahead + centre[..., None, :]
 
 
-def unproject(camera: Camera, pixels: Float[Array, "*b n 2"], depth: Float[Array, "*b n"]) -> Float[Array, "*b n 3"]:
+def unproject(
+    camera: Pinhole, pixels: Float[Pixels, "*b n 2"], depth: Float[Pixels, "*b n"]
+) -> Float[Pixels, "*b n 3"]:
     """Points in the camera frame of pixels (x, y) with depth along z (any unit; the points get the same)."""
-    rays = (pixels - camera.centre[..., None, :]) / camera.focal[..., None, :]
-    return jnp.concatenate([rays * depth[..., None], depth[..., None]], axis=-1)
+    xp, focal, centre = _parts(camera)
+    rays = (pixels - centre[..., None, :]) / focal[..., None, :]
+    return xp.concatenate([rays * depth[..., None], depth[..., None]], axis=-1)
 
 
 def pixel_grid(height: int, width: int) -> Float[Array, "h w 2"]:
@@ -38,11 +49,6 @@ def point_map(camera: Camera, depth: Float[Array, "h w"]) -> Float[Array, "h w 3
     height, width = depth.shape
     pixels = pixel_grid(height, width).reshape(-1, 2).astype(depth.dtype)
     return unproject(camera, pixels, depth.reshape(-1)).reshape(height, width, 3)
-
-
-Pinhole = TypeVar("Pinhole", Camera, np.ndarray)  # a camera in the graph, or a 3 × 3 matrix K on the host
-Pixels = TypeVar("Pixels", jax.Array, np.ndarray)
-Pair = tuple[int | float, int | float]  # (x, y)
 
 
 def crop(camera: Pinhole, first: Pair) -> Pinhole:
@@ -62,6 +68,47 @@ def resize(camera: Pinhole, before: Pair, after: Pair) -> Pinhole:
 def subsample(camera: Pinhole, step: Pair | int, first: Pair = (0, 0)) -> Pinhole:
     """The camera of the pixels ``first``, ``first + step``, ``first + 2 step`` …: ``image[first::step]``."""
     return _change(camera, *_subsampling(step, first))
+
+
+def look_at(camera: Float[np.ndarray, "3 3"], pixel: Float[np.ndarray, "2"]) -> Float[np.ndarray, "3 3"]:
+    """The least turn after which the camera looks along the ray of a pixel (x, y): ``camera_from_turned``."""
+    axis = unproject(camera, np.asarray(pixel, np.float64)[None], np.ones(1))[0]
+    axis = axis / np.linalg.norm(axis)
+    about = np.cross([0.0, 0.0, 1.0], axis)
+    sine = np.linalg.norm(about)
+    return rotation_from_vector(about / max(sine, 1e-300) * np.arctan2(sine, axis[2]))
+
+
+def turn(
+    camera: Float[np.ndarray, "3 3"], camera_from_turned: Float[np.ndarray, "3 3"], turned: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "3 3"]:
+    """The homography from the pixels of a turned camera's image to those of the camera that see the same.
+
+    Args:
+      camera: K.
+      camera_from_turned: the rotation; the cameras stand in the same place.
+      turned: K of the turned camera, whose image may have another size and scale.
+
+    Returns:
+      H, with ``(x, y, 1) ~ H (x', y', 1)``; a third coordinate that is not positive is of a ray behind the camera.
+    """
+    return camera @ camera_from_turned @ np.linalg.inv(turned)
+
+
+def middle(width: int | float, height: int | float) -> Float[np.ndarray, "2"]:
+    """Where the middle of an image is: the centre of a camera that looks straight through it."""
+    return np.array([(width - 1) / 2, (height - 1) / 2])
+
+
+def borders(camera: Float[np.ndarray, "*b 3 3"], width: int, height: int) -> Float[np.ndarray, "*b 4"]:
+    """Left, right, bottom and top of an image at depth 1, y up and looking along −z: the frustum as OpenGL wants it.
+
+    OpenGL, and MuJoCo with it, measures from the edges of pixels: half a pixel before the first centre, half a pixel
+    behind the last.
+    """
+    fx, fy, cx, cy = camera[..., 0, 0], camera[..., 1, 1], camera[..., 0, 2], camera[..., 1, 2]
+    sides = [-(cx + 0.5) / fx, (width - 0.5 - cx) / fx, -(height - 0.5 - cy) / fy, (cy + 0.5) / fy]
+    return np.stack(sides, axis=-1)
 
 
 def crop_pixels(pixels: Pixels, first: Pair) -> Pixels:
@@ -104,6 +151,13 @@ def _change(camera: Any, zoom: np.ndarray, shift: np.ndarray) -> Any:
     if isinstance(camera, Camera):
         return Camera(camera.focal * zoom.astype(camera.focal.dtype), _move(camera.centre, zoom, shift))
     return np.array([[zoom[0], 0, shift[0]], [0, zoom[1], shift[1]], [0, 0, 1]]) @ camera
+
+
+def _parts(camera: Any) -> tuple[Any, Any, Any]:
+    """NumPy or JAX, the focal lengths, and the centre."""
+    if isinstance(camera, Camera):
+        return jnp, camera.focal, camera.centre
+    return np, camera[..., [0, 1], [0, 1]], camera[..., :2, 2]
 
 
 def mostly(cover: Float[Array, "h w"] | Float[np.ndarray, "h w"]) -> Any:

@@ -1067,13 +1067,13 @@ def _degrade(arguments: argparse.Namespace) -> int:
     from ipjax.files.meshes.mesh import load_mesh, save_mesh
     from ipjax.files.storage.writing import write_text
     from ipjax.inference.reports import to_json
-    from ipjax.synthetic.degradation import degrade
+    from ipjax.synthetic.degradation import alignment_as_json, degrade
 
     mesh = load_mesh(arguments.mesh)
     worse, alignment = degrade(mesh, arguments.level, arguments.seed)
     save_mesh(worse, output)
     if arguments.alignment is not None:
-        write_text(arguments.alignment, to_json(alignment.as_json()))
+        write_text(arguments.alignment, to_json(alignment_as_json(alignment)))
     print(f"{output}: level {arguments.level}")
     return 0
 

@@ -118,7 +118,8 @@ def closest_symmetry(
     _require_axis(symmetries.translation, 1, "symmetries")
     count = symmetries.translation.shape[0]
     block = min(block, count)
-    truth_rotation, truth_translation = _compose(truth, symmetries)  # [s, 3, 3], [s, 3]
+    alike = truth @ symmetries  # [s]
+    truth_rotation, truth_translation = alike.scale[:, None, None] * alike.rotation, alike.translation
     estimate_matrix = estimate.scale * estimate.rotation
 
     def error(chosen: Array, vertices: Array) -> Array:
@@ -383,15 +384,9 @@ def reprojection_error(
     return jnp.mean(_length(seen - found))
 
 
-def _compose(truth: Similarity, symmetries: Similarity) -> tuple[Array, Array]:
-    """Matrix [s, 3, 3] and translation [s, 3] of truth ∘ symmetry, scale included."""
-    matrix = truth.scale * truth.rotation
-    rotation = jnp.matmul(matrix, symmetries.scale[:, None, None] * symmetries.rotation, precision=HIGHEST)
-    return rotation, jnp.matmul(symmetries.translation, matrix.T, precision=HIGHEST) + truth.translation
-
-
 def _apply(rotation: Array, translation: Array, points: Array) -> Array:
-    """``rotation @ x + translation`` for points [n, 3], as sums of products: exact in float32 on every backend."""
+    """``rotation @ x + translation`` for points [n, 3], as sums of products: exact in float32 on every backend. Not a
+    :class:`Similarity`, which the difference of two is not."""
     moved = sum(rotation[..., None, :, i] * points[:, i, None] for i in range(3))
     return moved + translation[..., None, :]
 

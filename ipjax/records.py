@@ -6,6 +6,8 @@ whatever was vmapped over. Frames: ``object`` is the normalised mesh (bounding-b
 """
 
 import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ipjax.transforms import Similarity
@@ -18,6 +20,21 @@ class Camera(eqx.Module):
 
     focal: Float[Array, "*b 2"]  # pixels, (x, y)
     centre: Float[Array, "*b 2"]  # pixels, (x, y)
+
+    @staticmethod
+    def from_matrix(K: Float[Array, "*b 3 3"] | Float[np.ndarray, "*b 3 3"]) -> "Camera":
+        """Of ``[fx 0 cx; 0 fy cy; 0 0 1]``, pixels; in float32. A skew is left out."""
+        return Camera(
+            focal=jnp.stack([jnp.asarray(K[..., i, i], jnp.float32) for i in (0, 1)], axis=-1),
+            centre=jnp.asarray(K[..., :2, 2], jnp.float32),
+        )
+
+    def to_matrix(self) -> Float[np.ndarray, "*b 3 3"]:
+        """``K = [fx 0 cx; 0 fy cy; 0 0 1]`` in pixels and NumPy's doubles, for the host."""
+        focal, centre = np.asarray(self.focal, np.float64), np.asarray(self.centre, np.float64)
+        K = np.zeros((*focal.shape[:-1], 3, 3))
+        K[..., [0, 1], [0, 1]], K[..., :2, 2], K[..., 2, 2] = focal, centre, 1
+        return K
 
 
 class View(eqx.Module):

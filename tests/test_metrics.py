@@ -27,12 +27,6 @@ def poses(rotation, translation, dtype=np.float32) -> Similarity:
     return Similarity(jnp.asarray(rotation), jnp.asarray(translation), jnp.ones(rotation.shape[:-2], dtype))
 
 
-def camera_of(matrix) -> Camera:
-    return Camera(
-        jnp.asarray([matrix[0, 0], matrix[1, 1]], jnp.float32), jnp.asarray([matrix[0, 2], matrix[1, 2]], jnp.float32)
-    )
-
-
 def symmetries_of(number: int) -> tuple[np.ndarray, np.ndarray]:
     info = json.loads(str(ERRORS[f"obj{number}_info_json"]))
     continuous = [(np.array(s["axis"]), np.array(s["offset"])) for s in info.get("symmetries_continuous", [])]
@@ -92,7 +86,7 @@ def test_pose_errors_are_bops(number):
     rows, truth, estimate = rows_of(number)
     points = jnp.asarray(ERRORS[f"obj{number}_pts"])
     symmetries = poses(*symmetries_of(number))
-    camera, diameter = camera_of(ERRORS["K"]), float(ERRORS[f"obj{number}_diameter"])
+    camera, diameter = Camera.from_matrix(ERRORS["K"]), float(ERRORS[f"obj{number}_diameter"])
 
     def all_errors(truth, estimate):
         return {
@@ -116,7 +110,7 @@ def test_pose_errors_are_bops(number):
 
 
 def test_vsd_is_bops_up_to_a_pixel_of_the_union():
-    camera = camera_of(VSD["K"])
+    camera = Camera.from_matrix(VSD["K"])
     taus = jnp.asarray(VSD["taus"], jnp.float32)
 
     def one(seen, truth, estimate, diameter):
@@ -213,7 +207,7 @@ def test_a_symmetry_of_the_truth_is_no_error():
     error, index = metrics.closest_symmetry(points, symmetries, truth, turned)
     assert error < 1e-3  # mm
     assert index == 100
-    assert metrics.mspd(points, symmetries, camera_of(ERRORS["K"]), truth, turned) < 1e-3
+    assert metrics.mspd(points, symmetries, Camera.from_matrix(ERRORS["K"]), truth, turned) < 1e-3
 
 
 def test_scale_is_part_of_the_pose():

@@ -26,11 +26,10 @@ from ipjax.files.storage.cache import cache_folder
 from ipjax.files.storage.writing import write_text
 from ipjax.files.weights.encoders import hash_file
 from ipjax.inference.estimator import Estimator, Result
-from ipjax.inference.reports import compose
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.mesh import onboard
 from ipjax.records import Patches, Similarity, View
-from ipjax.synthetic.degradation import degrade
+from ipjax.synthetic.degradation import alignment_as_json, degrade
 
 log = logging.getLogger("ipjax")
 
@@ -135,7 +134,7 @@ def _onboard(
     mesh, back = degrade(load_mesh(source), quality, seed)
     templates, info = onboard(mesh, encoder, config, name=source.stem, progress=progress)
     # Its map back is written first: an object file without one would be of no use.
-    write_text(path.with_suffix(".json"), json.dumps(back.as_json()))
+    write_text(path.with_suffix(".json"), json.dumps(alignment_as_json(back)))
     save(path, templates, dataclasses.replace(info, mesh_file=source.name))
     return _kept_alignment(path.with_suffix(".json"))
 
@@ -308,11 +307,10 @@ class Finder:
             if not bool(result.estimate.success):
                 self.refused.append(f"{where}: no pose found")
                 continue
-            rotation, translation, scale = compose(result.estimate.camera_from_object, info.object_from_mesh)
-            if alignment is None:
-                scale /= unit  # metres per metre of the model
+            pose = result.estimate.camera_from_object.to_numpy() @ info.object_from_mesh.to_numpy()
+            scale = float(pose.scale) if alignment is not None else float(pose.scale) / unit  # metres per metre of it
             score = target.score * float(result.estimate.confidence)
-            found.append(Estimate(target.obj_id, score, rotation, translation, scale))
+            found.append(Estimate(target.obj_id, score, pose.rotation, pose.translation, scale))
         return found
 
     def _index(self, obj_id: int) -> int:

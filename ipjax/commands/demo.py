@@ -9,20 +9,19 @@ import json
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 from scipy.spatial import KDTree
 
 from ipjax.config import Config
 from ipjax.files.meshes.mesh import Mesh, sample_surface, save_mesh
-from ipjax.files.object_file import SUFFIX, ObjectInfo
+from ipjax.files.object_file import SUFFIX
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.drawing import draw, gather_evidence, write_image
 from ipjax.inference.estimator import Estimator
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.mesh import onboard
 from ipjax.records import Similarity
-from ipjax.synthetic.degradation import Alignment, degrade
+from ipjax.synthetic.degradation import degrade
 from ipjax.synthetic.scenes import Scene, make_object, make_scene
 
 LOST = ("mug", "bottle", "corner", "wedge", "tee", "pot")  # what is looked for, by seed
@@ -91,7 +90,9 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
     if not bool(result.estimate.success):
         say("no pose was found")
         return False
-    found = _to_original(result.estimate.camera_from_object, info, original_from_copy)
+    # Only a demo or an evaluation knows how the copy lies in the original.
+    camera_from_copy = result.estimate.camera_from_object.to_numpy() @ info.object_from_mesh.to_numpy()
+    found = (camera_from_copy @ original_from_copy.inverse()).to_jax()
     comparison = compare(found, scene.camera_from_object[0], original)
     _print_comparison(found, scene.camera_from_object[0], comparison, float(result.estimate.confidence))
     say(f"the picture: {folder / 'overlay.png'}")
@@ -111,32 +112,18 @@ def write_inputs(folder: Path, scene: Scene, index: int) -> str:
     return " ".join(f"--{name} {path}" for name, path in names.items())
 
 
-def _to_original(camera_from_object: Similarity, info: ObjectInfo, original_from_copy: Alignment) -> Similarity:
-    """The estimate in the frame of the undistorted object; only a demo or an evaluation knows how to do that."""
-    rotation, translation, scale = (
-        np.asarray(x, np.float64)
-        for x in (camera_from_object.rotation, camera_from_object.translation, camera_from_object.scale)
-    )
-    scale = scale * info.mesh_scale  # metres per unit of the copy
-    translation = translation - scale * rotation @ np.asarray(info.mesh_centre)
-    turned = rotation @ original_from_copy.rotation.T
-    scale = scale / original_from_copy.scale
-    moved = translation - scale * turned @ original_from_copy.translation
-    return Similarity(*(jax.numpy.asarray(x, np.float32) for x in (turned, moved, scale)))
-
-
 def compare(found: Similarity, true: Similarity, mesh: Mesh) -> Comparison:
     """Two ``camera_from_object`` of one mesh of unit diameter, whose origin is its box's centre."""
-    found, true = (jax.tree.map(lambda x: np.asarray(x, np.float64), pose) for pose in (found, true))
-    cosine = (np.trace(np.asarray(found.rotation) @ np.asarray(true.rotation).T) - 1) / 2
+    here, there = found.to_numpy(), true.to_numpy()
+    cosine = (np.trace(here.rotation @ there.rotation.T) - 1) / 2
     points = sample_surface(mesh, 2000, seed=0)[0]
-    a, b = (float(p.scale) * points @ np.asarray(p.rotation).T + np.asarray(p.translation) for p in (found, true))
-    size = float(true.scale)
+    a, b = here @ points, there @ points
+    size = float(there.scale)
     return Comparison(
         rotation=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
-        translation=float(np.linalg.norm(np.asarray(found.translation) - np.asarray(true.translation))),
+        translation=float(np.linalg.norm(here.translation - there.translation)),
         true_size=size,
-        size=float(found.scale),
+        size=float(here.scale),
         add=float(np.linalg.norm(a - b, axis=-1).mean() / size),
         adds=float(KDTree(a).query(b)[0].mean() / size),
     )

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from ipjax.cameras import crop, resize
@@ -153,10 +152,7 @@ class Intrinsics:
     @property
     def camera(self) -> Camera:
         """The pinhole, as a record of arrays; distortion is not part of it."""
-        K = self.matrix
-        return Camera(
-            focal=jnp.asarray([K[0, 0], K[1, 1]], jnp.float32), centre=jnp.asarray([K[0, 2], K[1, 2]], jnp.float32)
-        )
+        return Camera.from_matrix(self.matrix)
 
 
 def as_intrinsics(camera: Any) -> Intrinsics:

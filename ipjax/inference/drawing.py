@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from ipjax.cameras import resize, resize_pixels
+from ipjax.cameras import project, resize, resize_pixels
 from ipjax.config import Config
 from ipjax.estimation.matching import match
 from ipjax.estimation.pipeline import comparable
@@ -68,7 +68,7 @@ def gather_evidence(
     crop_grid, template_grid = np.asarray(query.patches.grid), np.asarray(one.patches.grid[0])
     columns, rows = (int(side) + 1 for side in crop_grid.max(axis=0))
     cells = (int(template_grid[:, 0].max()) + 1, int(template_grid[:, 1].max()) + 1)
-    moved = _transform(estimate.camera_from_object, np.asarray(one.patches.points[0])[t])
+    moved = estimate.camera_from_object.to_numpy() @ np.asarray(one.patches.points[0], np.float64)[t]
     residual = np.linalg.norm(moved - np.asarray(query.patches.points)[q], axis=-1)
     return Evidence(
         crop=np.asarray(query.view.rgb),
@@ -174,7 +174,7 @@ def silhouette(
     """Where a mesh covers the image; vertices in the camera frame, faces that reach behind the camera left out."""
     cover = np.zeros((height, width), np.uint8)
     ahead = vertices[:, 2] > 1e-4
-    pixels = _project(vertices, matrix)
+    pixels = project(matrix, vertices)
     pixels = np.clip(pixels, -4 * max(height, width), 5 * max(height, width))
     faces = faces[ahead[faces].all(axis=1)]
     corners = np.round(pixels[faces] * 16).astype(np.int32)
@@ -198,16 +198,6 @@ def write_image(path: str | Path, image: np.ndarray) -> None:
         Image.fromarray(image).save(temporary, kind, **({"quality": 92} if kind == "JPEG" else {}))
 
 
-def _transform(pose: Similarity, points: np.ndarray) -> np.ndarray:
-    rotation, translation = np.asarray(pose.rotation, np.float64), np.asarray(pose.translation, np.float64)
-    return float(pose.scale) * np.asarray(points, np.float64) @ rotation.T + translation
-
-
-def _project(points: np.ndarray, K: np.ndarray) -> np.ndarray:
-    ahead = np.maximum(points[:, 2:], 1e-4)
-    return points[:, :2] / ahead * K[[0, 1], [0, 1]] + K[:2, 2]
-
-
 def _line(image: np.ndarray, a: np.ndarray, b: np.ndarray, colour, width: int, reach: float = 1e5) -> None:
     if np.abs([a, b]).max() > reach:
         return
@@ -222,12 +212,13 @@ def _sixteenths(point: np.ndarray) -> tuple[int, int]:
 
 
 def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) -> None:
+    camera_from_object = pose.to_numpy()
     height, width = image.shape[:2]
     stroke = max(round(height / 450), 1)
     if info.vertices is not None and info.faces is not None and len(info.faces):
         vertices = np.asarray(info.vertices, np.float64)
         low, high = vertices.min(axis=0), vertices.max(axis=0)
-        cover = silhouette(_transform(pose, vertices), info.faces, K, height, width)
+        cover = silhouette(camera_from_object @ vertices, info.faces, K, height, width)
         contours, _ = cv2.findContours(cover.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         glow = np.zeros_like(cover, np.uint8)
         cv2.drawContours(glow, contours, -1, 255, 3 * stroke + 2)
@@ -242,9 +233,9 @@ def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) 
         low = high = None
     if low is not None and high is not None:
         corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
-        placed = _transform(pose, corners)
+        placed = camera_from_object @ corners
         if (placed[:, 2] > 1e-3).all():
-            pixels, hidden = _project(placed, K), int(np.argmax(placed[:, 2]))
+            pixels, hidden = project(K, placed), int(np.argmax(placed[:, 2]))
             # Edges of the farthest corner lie behind the object: faint, and first.
             for a, b in sorted(_EDGES, key=lambda edge: hidden not in edge):
                 if hidden in (a, b):
@@ -255,9 +246,9 @@ def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) 
                     soft = image.copy()
                     _line(soft, pixels[a], pixels[b], _INK, 1)
                     cv2.addWeighted(soft, 0.75, image, 0.25, 0, image)
-    placed = _transform(pose, np.concatenate([np.zeros((1, 3)), 0.45 * np.eye(3)]))
+    placed = camera_from_object @ np.concatenate([np.zeros((1, 3)), 0.45 * np.eye(3)])
     if (placed[:, 2] > 1e-3).all():
-        pixels = _project(placed, K)
+        pixels = project(K, placed)
         for axis in np.argsort(-placed[1:, 2]):
             _line(image, pixels[0], pixels[axis + 1], _AXES[axis], stroke + 1)
         canvas = Image.fromarray(image)

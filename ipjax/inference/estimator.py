@@ -162,14 +162,13 @@ def doubt_size(
 
 def _turn(camera_from_crop: Similarity, found: PoseEstimate) -> PoseEstimate:
     """The estimate in the camera of the whole image: the crop's camera is only turned."""
-    turn = np.asarray(camera_from_crop.rotation, np.float64)
+    host = camera_from_crop.to_numpy()
+    turn = host.rotation
     if np.array_equal(turn, np.eye(3)):
         return found
 
     def turned(pose: Similarity) -> Similarity:
-        rotation = turn @ np.asarray(pose.rotation, np.float64)
-        translation = np.asarray(pose.translation, np.float64) @ turn.T
-        return Similarity(jnp.asarray(rotation, jnp.float32), jnp.asarray(translation, jnp.float32), pose.scale)
+        return (host @ pose.to_numpy()).to_jax()
 
     both = np.kron(np.eye(2), turn)
     covariance = both @ np.asarray(found.covariance, np.float64) @ both.T

@@ -12,7 +12,18 @@ import numpy as np
 from jaxtyping import Float
 
 from ipjax.cameras import crop as crop_camera
-from ipjax.cameras import crop_pixels, mostly, resize, resize_pixels, subsample_pixels
+from ipjax.cameras import (
+    crop_pixels,
+    look_at,
+    middle,
+    mostly,
+    project,
+    resize,
+    resize_pixels,
+    subsample_pixels,
+    turn,
+    unproject,
+)
 from ipjax.files.camera_files import Intrinsics, as_intrinsics, list_misfits
 from ipjax.files.images import as_mask, as_native, check_mask, forget_sentinel
 from ipjax.records import Camera, Similarity, View
@@ -194,17 +205,9 @@ def frame_turned(
         rgb=jnp.asarray(rgb),
         depth=jnp.asarray(depth),
         mask=jnp.asarray(mask),
-        camera=Camera(
-            focal=jnp.asarray([matrix[0, 0], matrix[1, 1]], jnp.float32),
-            centre=jnp.asarray([matrix[0, 2], matrix[1, 2]], jnp.float32),
-        ),
+        camera=Camera.from_matrix(matrix),
     )
-    turned = Similarity(
-        rotation=jnp.asarray(rotation, jnp.float32),
-        translation=jnp.zeros(3, jnp.float32),
-        scale=jnp.ones((), jnp.float32),
-    )
-    return view, turned
+    return view, Similarity(rotation, np.zeros(3), np.ones(())).to_jax()
 
 
 def clean_depth(depth: np.ndarray, edge_tolerance: float = 0.02) -> np.ndarray:
@@ -498,21 +501,13 @@ def _cut_square(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, ed
 def _cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, edge_tolerance):
     left, top, right, bottom = bounds
     corners = np.array([[left, top], [right - 1, top], [left, bottom - 1], [right - 1, bottom - 1]], np.float64)
-    rays = np.concatenate([(corners - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones((4, 1))], axis=-1)
-    axis = np.array([(rays[0, 0] + rays[1, 0]) / 2, (rays[0, 1] + rays[2, 1]) / 2, 1.0])
-    axis /= np.linalg.norm(axis)
-    # The smallest turn that takes the optical axis to the mask's centre.
-    turn = np.cross([0.0, 0.0, 1.0], axis)
-    sine, cosine = np.linalg.norm(turn), axis[2]
-    camera_from_crop = np.eye(3)
-    if sine > 1e-9:
-        camera_from_crop = cv2.Rodrigues(turn / sine * np.arctan2(sine, cosine))[0]
+    camera_from_crop = look_at(K, corners.mean(0))
     crop_from_camera = camera_from_crop.T
-    seen = rays @ crop_from_camera.T
-    half = (1 + pad) * np.abs(seen[:, :2] / seen[:, 2:]).max()
+    rays = unproject(K, corners, np.ones(4))
+    half = (1 + pad) * np.abs(project(np.eye(3), rays @ crop_from_camera.T)).max()
     focal = resolution / 2 / half
-    centre = (resolution - 1) / 2
-    matrix = np.array([[focal, 0, centre], [0, focal, centre], [0, 0, 1]])
+    cx, cy = middle(resolution, resolution)
+    matrix = np.array([[focal, 0, cx], [0, focal, cy], [0, 0, 1]])
 
     # Depth is cleaned where it was measured, then looked up.
     margin = max(int(0.25 * max(right - left, bottom - top)), 8)
@@ -523,7 +518,7 @@ def _cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, e
     cover = np.ascontiguousarray(mask[y0:y1, x0:x1])
     piece = _trusted(piece, cover, erosion, edge_tolerance)
 
-    image_from_crop = K @ camera_from_crop @ np.linalg.inv(matrix)
+    image_from_crop = turn(K, camera_from_crop, matrix)
     zoom = focal / float(np.sqrt(K[0, 0] * K[1, 1]))
     many = max(int(np.ceil(1 / zoom - 0.25)), 1)  # samples per crop pixel and axis, averaged when shrinking
     size = (resolution * many, resolution * many)
@@ -537,9 +532,9 @@ def _cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, e
     y, x = np.indices((resolution, resolution))
     rays = np.stack([x, y, np.ones_like(x)], -1) @ (piece_from_image @ image_from_crop).T
     x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    inside = (rays[..., 2] > 0) & (np.abs(x - (x1 - x0 - 1) / 2) <= (x1 - x0) / 2)
-    inside &= np.abs(y - (y1 - y0 - 1) / 2) <= (y1 - y0) / 2
-    seen = np.stack([(x + x0 - K[0, 2]) / K[0, 0], (y + y0 - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    x_middle, y_middle = middle(x1 - x0, y1 - y0)
+    inside = (rays[..., 2] > 0) & (np.abs(x - x_middle) <= (x1 - x0) / 2) & (np.abs(y - y_middle) <= (y1 - y0) / 2)
+    seen = unproject(crop_camera(K, (x0, y0)), np.stack([x, y], -1), np.ones_like(x))
     cut_depth = sample_depth(piece, x, y, edge_tolerance) * (seen @ crop_from_camera[2]).astype(np.float32)
     cut_depth = np.where(inside, cut_depth, np.float32(0))
     return cut_rgb, cut_depth, cut_mask, matrix, camera_from_crop

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -33,55 +33,27 @@ CONVENTIONS = {
 UNSURE_TURN = 25.0  # degrees of standard deviation from which people are told about it
 
 
-class Plain(NamedTuple):
-    """A similarity of doubles: the records of `ipjax.records` are JAX arrays, which keep floats only."""
-
-    rotation: np.ndarray
-    translation: np.ndarray
-    scale: Any
-
-
-def compose(a_from_b: Similarity | Plain, b_from_c: Similarity | Plain) -> tuple[np.ndarray, np.ndarray, float]:
-    """Rotation, translation and scale of ``a_from_c``, in double precision."""
-    outer, inner = (
-        tuple(np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
-        for pose in (a_from_b, b_from_c)
-    )
-    rotation = outer[0] @ inner[0]
-    return rotation, outer[2] * outer[0] @ inner[1] + outer[1], float(outer[2] * inner[2])
-
-
-def tell_pose(rotation: np.ndarray, translation: np.ndarray, scale: float, unit: str) -> dict[str, Any]:
+def tell_pose(camera_from_b: Similarity[np.ndarray], unit: str) -> dict[str, Any]:
     """A similarity to camera metres as JSON can say it; `unit` names what the scale is per."""
-    rigid, full = np.eye(4), np.eye(4)
-    rigid[:3, :3], full[:3, :3] = rotation, scale * rotation
-    rigid[:3, 3] = full[:3, 3] = translation
+    rigid = Similarity(camera_from_b.rotation, camera_from_b.translation, np.ones(()))
     return {
-        "matrix": full.tolist(),
-        "rigid_matrix": rigid.tolist(),
-        "rotation": rotation.tolist(),
-        "translation_m": translation.tolist(),
-        f"scale_m_per_{unit}": scale,
+        "matrix": camera_from_b.to_matrix().tolist(),
+        "rigid_matrix": rigid.to_matrix().tolist(),
+        "rotation": camera_from_b.rotation.tolist(),
+        "translation_m": camera_from_b.translation.tolist(),
+        f"scale_m_per_{unit}": float(camera_from_b.scale),
     }
 
 
-def invert(a_from_b: Similarity | Plain) -> Plain:
-    """``b_from_a``, in double precision."""
-    rotation, translation, scale = (
-        np.asarray(x, np.float64) for x in (a_from_b.rotation, a_from_b.translation, a_from_b.scale)
-    )
-    return Plain(rotation.T, -rotation.T @ translation / scale, 1 / scale)
-
-
-def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> tuple[np.ndarray, np.ndarray, float]:
-    """``camera_from_reference_camera`` of an estimate: rotation, translation (metres), scale (metres per unit there).
+def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> Similarity[np.ndarray]:
+    """``camera_from_reference_camera`` of an estimate: metres here, and per unit there; in doubles.
 
     Raises ValueError for an object that was not made from a photo.
     """
     if info.reference is None:
         raise ValueError("the object was not made from a photo")
-    camera_from_mesh = Plain(*compose(camera_from_object, info.object_from_mesh))
-    return compose(camera_from_mesh, invert(info.reference.camera_from_mesh))
+    camera_from_mesh = camera_from_object.to_numpy() @ info.object_from_mesh.to_numpy()
+    return camera_from_mesh @ info.reference.camera_from_mesh.to_numpy().inverse()
 
 
 def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict[str, Any]:
@@ -89,21 +61,22 @@ def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict
 
     Raises ValueError as `relative_pose`.
     """
-    rotation, translation, scale = relative_pose(camera_from_object, info)
+    pose = relative_pose(camera_from_object, info)
     assert info.reference is not None
-    told = tell_pose(rotation, translation, scale, "reference_unit")
+    told = tell_pose(pose, "reference_unit")
     told["reference_unit"] = "m" if info.reference.metric else None
     told["reference_photo"] = info.reference.file
-    told["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1) / 2, -1, 1))))
+    told["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1) / 2, -1, 1))))
     if info.reference.metric:
         # A wrong scale about the camera would move the object: it is taken out about the object's centre.
-        centre = np.asarray(info.mesh_centre, np.float64)[None]
         reference = info.reference
-        there = reference.scale * centre @ np.asarray(reference.rotation).T + np.asarray(reference.translation)
-        here = scale * there @ rotation.T + translation
-        motion = np.eye(4)
-        motion[:3, :3], motion[:3, 3] = rotation, (here - there @ rotation.T)[0]
-        told["rigid_motion"] = motion.tolist()
+        camera_from_mesh = Similarity(
+            *(np.asarray(x, np.float64) for x in (reference.rotation, reference.translation, reference.scale))
+        )
+        there = camera_from_mesh @ np.asarray(info.mesh_centre, np.float64)[None]
+        turn = Similarity(pose.rotation, np.zeros(3), np.ones(()))
+        motion = Similarity(pose.rotation, (pose @ there - turn @ there)[0], np.ones(()))
+        told["rigid_motion"] = motion.to_matrix().tolist()
     return told
 
 
@@ -133,15 +106,14 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
     }
     if not found:
         return told
-    pose = estimate.camera_from_object
-    rotation, translation, scale = (np.asarray(x, np.float64) for x in (pose.rotation, pose.translation, pose.scale))
-    told["camera_from_mesh"] = tell_pose(*compose(pose, info.object_from_mesh), "mesh_unit")
-    told["camera_from_object"] = tell_pose(rotation, translation, float(scale), "model_unit")
+    pose, object_from_mesh = estimate.camera_from_object.to_numpy(), info.object_from_mesh.to_numpy()
+    told["camera_from_mesh"] = tell_pose(pose @ object_from_mesh, "mesh_unit")
+    told["camera_from_object"] = tell_pose(pose, "model_unit")
     if info.reference is not None:
-        told["camera_from_reference_camera"] = tell_relative_pose(pose, info)
+        told["camera_from_reference_camera"] = tell_relative_pose(estimate.camera_from_object, info)
     told["size_mm"] = {
-        "diameter": 1e3 * float(scale),
-        "box": [1e3 * float(scale) * float(side) for side in np.asarray(templates.extents)],
+        "diameter": 1e3 * float(pose.scale),
+        "box": [1e3 * float(pose.scale) * float(side) for side in np.asarray(templates.extents)],
         "diameter_std": 1e3 * float(estimate.scale_std),
     }
     told["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
@@ -161,16 +133,16 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
     told["template"] = int(estimate.view)
     told["alternatives"] = []
     scores = np.asarray(estimate.hypotheses.score)
+    many = estimate.hypotheses.camera_from_object.to_numpy()
     for i in range(1, min(alternatives + 1, len(scores))):
-        many = estimate.hypotheses.camera_from_object
-        other = Similarity(many.rotation[i], many.translation[i], many.scale[i])
-        finite = all(np.isfinite(np.asarray(x)).all() for x in (other.rotation, other.translation, other.scale))
+        other = Similarity(many.rotation[i], many.translation[i], np.asarray(many.scale[i]))
+        finite = all(np.isfinite(x).all() for x in (other.rotation, other.translation, other.scale))
         if scores[i] <= 0 or not finite:
             continue
         told["alternatives"].append(
             {
                 "score": float(scores[i]),
-                "camera_from_mesh": tell_pose(*compose(other, info.object_from_mesh), "mesh_unit"),
+                "camera_from_mesh": tell_pose(other @ object_from_mesh, "mesh_unit"),
             }
         )
     return told

@@ -33,11 +33,11 @@ def framing_cameras(
     Queries are cropped around their mask in the same way, so that an object seen end-on is as large in its template
     as in the query's crop.
     """
-    rotation = np.asarray(camera_from_object.rotation, np.float64)
-    translation = np.asarray(camera_from_object.translation, np.float64)
-    low, high = np.empty((len(rotation), 2)), np.empty((len(rotation), 2))
-    for view in range(len(rotation)):
-        placed = vertices @ rotation[view].T + translation[view]
+    poses = camera_from_object.to_numpy()
+    count = len(poses.scale)
+    low, high = np.empty((count, 2)), np.empty((count, 2))
+    for view in range(count):  # one at a time: all placed vertices would take much memory
+        placed = Similarity(poses.rotation[view], poses.translation[view], np.asarray(poses.scale[view])) @ vertices
         rays = placed[:, :2] / placed[:, 2:]
         low[view], high[view] = rays.min(0), rays.max(0)
     side = np.maximum((high - low).max(axis=1), 1e-6) / fill

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from ipjax.cameras import resize
+from ipjax.cameras import borders, resize
 from ipjax.files.meshes.mesh import Mesh, sample_texture
 from ipjax.progress import bar
 from ipjax.records import Camera, Similarity, View
@@ -330,19 +330,8 @@ def _write_job(job: _Job, folder: Path) -> None:
             texture=texture,
         )
     near, far = job.near_far().T
-    fx, fy, cx, cy = job.intrinsics.T
-    # GL measures from pixel edges, OpenCV from centres: the image spans [−1/2, width − 1/2].
-    frusta = np.stack(
-        [
-            -(cx + 0.5) / fx * near,
-            (job.width - 0.5 - cx) / fx * near,
-            -(job.height - 0.5 - cy) / fy * near,
-            (cy + 0.5) / fy * near,
-            near,
-            far,
-        ],
-        axis=-1,
-    )
+    sides = borders(np.broadcast_to(job.camera.to_matrix(), (len(near), 3, 3)), job.width, job.height)
+    frusta = np.concatenate([sides * near[:, None], near[:, None], far[:, None]], axis=-1)
     np.save(folder / "poses.npy", job.poses)
     np.save(folder / "frusta.npy", frusta)
     light = None

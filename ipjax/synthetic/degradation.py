@@ -15,10 +15,10 @@ lies within 1e-6 of the mirror is on it. So the topology does not hang on the la
 import dataclasses
 
 import numpy as np
-from jaxtyping import Float
 from scipy import ndimage, sparse
 
 from ipjax.files.meshes.mesh import Mesh, make_mesh, normalise, sample_texture, vertex_normals
+from ipjax.transforms import Similarity
 
 STEPS = {1: 3, 2: 10}  # of smoothing
 BUMPS = {1: 0.01, 2: 0.03, 3: 0.0, 4: 0.03}  # rms, diameters
@@ -31,30 +31,18 @@ BUMP_LENGTH = 0.15  # diameters; bumps are as wide as that
 SMOOTHING = 0.5  # how far a vertex goes towards the mean of its neighbours
 
 
-@dataclasses.dataclass(frozen=True)
-class Alignment:
-    """``x_original = scale * rotation @ x_degraded + translation``; for evaluation only."""
-
-    scale: float
-    rotation: Float[np.ndarray, "3 3"]
-    translation: Float[np.ndarray, "3"]
-
-    def __matmul__(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Points of the degraded mesh in the original mesh's frame."""
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def as_json(self) -> dict:
-        """The form in which alignment files are kept."""
-        return {
-            "comment": "x_original = scale * R @ x_degraded + t; for evaluation only",
-            "scale": self.scale,
-            "R": self.rotation.tolist(),
-            "t": self.translation.tolist(),
-        }
+def alignment_as_json(original_from_degraded: Similarity[np.ndarray]) -> dict:
+    """The form in which alignment files are kept."""
+    return {
+        "comment": "x_original = scale * R @ x_degraded + t; for evaluation only",
+        "scale": float(original_from_degraded.scale),
+        "R": original_from_degraded.rotation.tolist(),
+        "t": original_from_degraded.translation.tolist(),
+    }
 
 
-def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Alignment]:
-    """A worse mesh, and the map from its frame back to the given mesh's (which nobody but an evaluation may see).
+def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Similarity[np.ndarray]]:
+    """A worse mesh, and ``original_from_degraded``, the map back to the given mesh's frame, for evaluations only.
 
     The result is a mesh of its own: unknown scale (0.1 to 10 diameters) and rotation. Its `seen` is 0 on the half that
     was made up. Where the mesh has no texture, its vertex colours are blurred along its edges to the same width.
@@ -106,8 +94,9 @@ def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Alignment]:
         seen=worse.seen,
         notes=(f"degraded to level {level}, seed {seed}",),
     )
-    back = Alignment(1 / (scale * unit.scale), np.ascontiguousarray(rotation.T), np.asarray(unit.centre, np.float64))
-    return result, back
+    degraded_from_unit = Similarity(rotation, np.zeros(3), np.asarray(scale))
+    original_from_unit = Similarity(np.eye(3), np.asarray(unit.centre, np.float64), np.asarray(1 / unit.scale))
+    return result, original_from_unit @ degraded_from_unit.inverse()
 
 
 @dataclasses.dataclass(frozen=True)

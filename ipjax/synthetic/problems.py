@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
+from ipjax.cameras import middle
 from ipjax.estimation.features import describe
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Appearance, Camera, Patches, Query, Similarity, Surface, Templates, View
@@ -50,7 +51,7 @@ def see(camera_from_object: Similarity, side: int, fill: float = 0.83) -> View:
     translation = np.asarray(camera_from_object.translation, np.float64)
     reach = 0.5 * float(camera_from_object.scale) / np.linalg.norm(translation)
     focal = fill * side / 2 / reach
-    centre = (side - 1) / 2 - focal * translation[:2] / translation[2]
+    centre = middle(side, side) - focal * translation[:2] / translation[2]
     rgb, depth, mask = picture(camera_from_object, np.array([focal, focal]), centre, side, side)
     return View(
         jnp.asarray(rgb, jnp.float32),
@@ -107,7 +108,7 @@ def make_frame(seed: int, height: int = 480, width: int = 640, share: tuple[floa
     """
     rng = np.random.default_rng(seed)
     focal = rng.uniform(0.8, 1.2) * width * np.array([1, rng.uniform(0.99, 1.01)])
-    centre = np.array([(width - 1) / 2, (height - 1) / 2]) + rng.normal(0, 0.01, 2) * width
+    centre = middle(width, height) + rng.normal(0, 0.01, 2) * width
     scale, wanted = rng.uniform(0.1, 0.3), rng.uniform(*share) * height
     distance = focal[1] * scale / wanted
     room = 0.7 * wanted

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from ipjax.cameras import resize_pixels
+from ipjax.cameras import middle, project, resize_pixels
 from ipjax.files.meshes.mesh import Mesh, make_mesh, normalise
 from ipjax.records import Camera, Similarity
 from ipjax.rendering.render import render_scene
@@ -61,8 +61,7 @@ class Scene:
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """K, pixels."""
-        (fx, fy), (cx, cy) = np.asarray(self.camera.focal, float), np.asarray(self.camera.centre, float)
-        return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        return self.camera.to_matrix()
 
 
 # --- textures ---------------------------------------------------------------------------------------------------------
@@ -459,15 +458,15 @@ def make_scene(
     camera = _draw_camera(rng)
     camera_from_world = _choose_view(rng, meshes, world_from_object, camera, least_visible)
 
-    poses = [_compose(camera_from_world, pose) for pose in world_from_object]
-    room = [(mesh, _similarity(*camera_from_world, 1.0)) for mesh in _make_room(rng)]
-    down = camera_from_world[0] @ np.array([0.0, 0, -1])
+    poses = [camera_from_world @ pose for pose in world_from_object]
+    room = [(mesh, camera_from_world.to_jax()) for mesh in _make_room(rng)]
+    down = camera_from_world.rotation @ np.array([0.0, 0, -1])
     light = {
         "direction": down + 0.7 * rng.normal(size=3) * [1, 1, 0.5],
         "ambient": float(rng.uniform(0.45, 0.7)),
         "diffuse": float(rng.uniform(0.35, 0.6)),
     }
-    placed = [(mesh, _similarity(*pose)) for mesh, pose in zip(meshes, poses, strict=True)]
+    placed = [(mesh, pose.to_jax()) for mesh, pose in zip(meshes, poses, strict=True)]
     renders = render_scene([*placed, *room], camera, HEIGHT, WIDTH, light=light, oversample=oversample, backend=backend)
     if renders.ids is None:
         raise RuntimeError("the renderer returned no segmentation")
@@ -491,21 +490,9 @@ def _make_bystander(number: int) -> Mesh:
     return make_object(KINDS[number % len(KINDS)], 10**9 + number)
 
 
-_Pose = tuple[np.ndarray, np.ndarray, float]  # rotation, translation, scale
-
-
-def _similarity(rotation: np.ndarray, translation: np.ndarray, scale: float) -> Similarity:
-    return Similarity(*(jnp.asarray(x, jnp.float32) for x in (rotation, translation, scale)))
-
-
-def _compose(camera_from_world: tuple[np.ndarray, np.ndarray], pose: _Pose) -> _Pose:
-    rotation, translation = camera_from_world
-    return rotation @ pose[0], rotation @ pose[1] + translation, pose[2]
-
-
 def _draw_camera(rng: np.random.Generator) -> Camera:
     focal = rng.uniform(520, 640) * np.array([1, rng.uniform(0.99, 1.01)])
-    centre = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2]) + rng.normal(0, 6, 2)
+    centre = middle(WIDTH, HEIGHT) + rng.normal(0, 6, 2)
     return Camera(focal=jnp.asarray(focal, jnp.float32), centre=jnp.asarray(centre, jnp.float32))
 
 
@@ -521,8 +508,10 @@ def _rotate_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.eye(3) + skew + skew @ skew / (1 + cosine)
 
 
-def _place(rng: np.random.Generator, meshes: Sequence[Mesh], diameters: Sequence[float]) -> list[_Pose]:
-    """Rest every mesh on a face of its hull, the larger the likelier, where it does not stand in another."""
+def _place(
+    rng: np.random.Generator, meshes: Sequence[Mesh], diameters: Sequence[float]
+) -> list[Similarity[np.ndarray]]:
+    """``world_from_object``: every mesh rests on a face of its hull, the larger the likelier, apart from others."""
     poses, taken = [], []
     for mesh, diameter in zip(meshes, diameters, strict=True):
         hull = ConvexHull(mesh.vertices)
@@ -540,7 +529,8 @@ def _place(rng: np.random.Generator, meshes: Sequence[Mesh], diameters: Sequence
             reach = 0.11 + 0.0022 * attempt  # as near as there is room
             offset = rng.uniform(-reach, reach, 2)
         taken.append(shadow + offset)
-        poses.append((rotation, np.array([*offset, -corners[:, 2].min()]), float(diameter)))
+        translation = np.array([*offset, -corners[:, 2].min()])
+        poses.append(Similarity(rotation, translation, np.asarray(diameter, np.float64)))
     return poses
 
 
@@ -558,16 +548,20 @@ def _apart(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def _choose_view(
-    rng: np.random.Generator, meshes: Sequence[Mesh], poses: Sequence[_Pose], camera: Camera, least: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """A camera above the table from which enough of the first object is seen; else the best of forty."""
+    rng: np.random.Generator,
+    meshes: Sequence[Mesh],
+    world_from_object: Sequence[Similarity[np.ndarray]],
+    camera: Camera,
+    least: float,
+) -> Similarity[np.ndarray]:
+    """``camera_from_world`` of a camera above the table that sees enough of the first object; else the best of 40."""
     clouds = []
-    for mesh, (rotation, translation, scale) in zip(meshes, poses, strict=True):
+    for mesh, pose in zip(meshes, world_from_object, strict=True):
         picked = rng.choice(len(mesh.vertices), min(1500, len(mesh.vertices)), replace=False)
-        clouds.append(scale * mesh.vertices[picked] @ rotation.T + translation)
+        clouds.append(pose @ mesh.vertices[picked])
     best, best_seen = None, -1.0
     for _ in range(40):
-        view = _look(rng, poses[0][1])
+        view = _look(rng, world_from_object[0].translation)
         seen = _visible_share(clouds, view, camera)
         if seen > best_seen:
             best, best_seen = view, seen
@@ -577,7 +571,8 @@ def _choose_view(
     return best
 
 
-def _look(rng: np.random.Generator, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _look(rng: np.random.Generator, target: np.ndarray) -> Similarity[np.ndarray]:
+    """``camera_from_world`` of a camera that looks about at the target, nearly upright."""
     azimuth, elevation, distance = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 1.25), rng.uniform(0.45, 0.9)
     backwards = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     position = target + distance * backwards
@@ -588,17 +583,17 @@ def _look(rng: np.random.Generator, target: np.ndarray) -> tuple[np.ndarray, np.
     rotation = np.stack([right, np.cross(ahead, right), ahead])
     roll = rng.normal(0, 0.12)
     rotation = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]) @ rotation
-    return rotation, -rotation @ position
+    return Similarity(rotation, -rotation @ position, np.ones(()))
 
 
-def _visible_share(clouds: Sequence[np.ndarray], view: tuple[np.ndarray, np.ndarray], camera: Camera) -> float:
+def _visible_share(clouds: Sequence[np.ndarray], camera_from_world: Similarity[np.ndarray], camera: Camera) -> float:
     """Share of the first object's coarse outline where nothing is in front of it and the image has not ended."""
     cell = 10
     rows, columns = HEIGHT // cell, WIDTH // cell
     nearest = np.full((len(clouds), 3 * rows, 3 * columns), np.inf)
     for layer, cloud in zip(nearest, clouds, strict=True):
-        points = cloud @ view[0].T + view[1]
-        pixels = points[:, :2] / points[:, 2:] * np.asarray(camera.focal) + np.asarray(camera.centre)
+        points = camera_from_world @ cloud
+        pixels = project(camera.to_matrix(), points)
         x, y = np.rint(resize_pixels(pixels, (cell, cell), (1, 1))).astype(int).T + np.array([[columns], [rows]])
         inside = (x >= 0) & (x < 3 * columns) & (y >= 0) & (y < 3 * rows)
         np.minimum.at(layer, (y[inside], x[inside]), points[inside, 2])
@@ -610,13 +605,11 @@ def _visible_share(clouds: Sequence[np.ndarray], view: tuple[np.ndarray, np.ndar
     return float((mine & shown).sum() / max(mine.sum(), 1))
 
 
-def _outline_area(mesh: Mesh, pose: _Pose, camera: Camera) -> int:
+def _outline_area(mesh: Mesh, camera_from_object: Similarity[np.ndarray], camera: Camera) -> int:
     """Pixels that the mesh would cover if nothing stood before it, outside the image included."""
-    rotation, translation, scale = pose
     import cv2
 
-    points = scale * mesh.vertices @ rotation.T + translation
-    pixels = points[:, :2] / points[:, 2:] * np.asarray(camera.focal) + np.asarray(camera.centre)
+    pixels = project(camera.to_matrix(), camera_from_object @ mesh.vertices)
     low = np.floor(pixels.min(0)) - 1
     width, height = (np.ceil(pixels.max(0)) - low + 2).astype(int)
     canvas = np.zeros((height, width), np.uint8)

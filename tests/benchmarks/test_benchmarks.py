@@ -17,8 +17,7 @@ from benchmarks.results_page import Study
 from ipjax.config import ConfidenceConfig, Config
 from ipjax.estimation.confidence import probability
 from ipjax.files.settings import describe_config, read_config
-from ipjax.inference.reports import Plain, compose, invert
-from ipjax.records import Agreement
+from ipjax.records import Agreement, Similarity
 from ipjax.synthetic.degradation import degrade
 from ipjax.synthetic.scenes import make_object
 
@@ -157,12 +156,11 @@ def test_an_estimate_of_a_degraded_mesh_is_one_of_the_true_mesh():
     mesh = make_object("mug")
     _, back = degrade(mesh, 3)
     turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
-    truth = Plain(turn * np.sign(np.linalg.det(turn)), np.array([0.1, -0.2, 0.9]), 0.2)
-    camera_from_worse = Plain(*compose(truth, Plain(back.rotation, back.translation, back.scale)))
-    info = SimpleNamespace(object_from_mesh=Plain(np.eye(3), np.array([0.1, 0.0, 0.3]), 2.0))
-    camera_from_object = Plain(*compose(camera_from_worse, invert(info.object_from_mesh)))
-    for found, true in zip(camera_from_true_mesh(camera_from_object, info, back), truth, strict=True):
-        np.testing.assert_allclose(found, true, atol=1e-9)
+    truth = Similarity(turn * np.sign(np.linalg.det(turn)), np.array([0.1, -0.2, 0.9]), np.asarray(0.2))
+    info = SimpleNamespace(object_from_mesh=Similarity(np.eye(3), np.array([0.1, 0.0, 0.3]), np.asarray(2.0)))
+    camera_from_object = truth @ back @ info.object_from_mesh.inverse()
+    found = camera_from_true_mesh(camera_from_object, info, back)
+    np.testing.assert_allclose(found.to_matrix(), truth.to_matrix(), atol=1e-9)
 
 
 def make_row(turn: int, right: bool, *, surprise: float = 6.0) -> dict:

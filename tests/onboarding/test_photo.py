@@ -17,7 +17,7 @@ from ipjax import cli
 from ipjax.config import OnboardConfig
 from ipjax.files.images import Intrinsics
 from ipjax.files.object_file import Reference, check, load, save
-from ipjax.inference.reports import CONVENTIONS, compose, invert, relative_pose, tell_relative_pose
+from ipjax.inference.reports import CONVENTIONS, relative_pose, tell_relative_pose
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.onboarding import photo as photos
 from ipjax.onboarding import report as onboarding_report
@@ -69,9 +69,9 @@ def test_a_photo_with_depth_makes_an_object_in_metres(metric, tmp_path):
     assert info.measured_diameter == pytest.approx(0.12, rel=0.25)  # the box's diagonal is what diameter may not exceed
     assert 0.2 < reference.seen < 0.6
     # The centre of the object, told through the file's own numbers, stands where the ball stands.
-    camera_from_object = compose(reference.camera_from_mesh, invert(info.object_from_mesh))
-    np.testing.assert_allclose(camera_from_object[1][:2], 0, atol=0.005)
-    assert 0.54 < camera_from_object[1][2] < 0.62  # behind its front; how far the back reaches is guessed
+    camera_from_object = reference.camera_from_mesh @ info.object_from_mesh.inverse()
+    np.testing.assert_allclose(camera_from_object.translation[:2], 0, atol=0.005)
+    assert 0.54 < camera_from_object.translation[2] < 0.62  # behind its front; how far the back reaches is guessed
     path = tmp_path / "ball.ipjax"
     save(path, metric.templates, info)
     again = load(path)[1].reference
@@ -92,18 +92,14 @@ def test_objects_made_from_meshes_have_no_reference(tmp_path):
 def test_the_pose_relative_to_the_photo_is_the_motion_of_the_camera(metric):
     """A camera moved by a known motion sees the object where that motion puts it, whatever the mesh's frame."""
     reference, info = metric.info.reference, metric.info
-    motion = turn([1, 2, -1], 0.7), np.array([0.1, -0.05, 0.2])
-    there = compose(reference.camera_from_mesh, invert(info.object_from_mesh))
-    here = similarity(motion[0] @ there[0], motion[0] @ there[1] + motion[1], there[2])
-    rotation, translation, scale = relative_pose(here, info)
-    np.testing.assert_allclose(rotation, motion[0], atol=1e-5)
-    np.testing.assert_allclose(translation, motion[1], atol=1e-5)
-    assert scale == pytest.approx(1.0, abs=1e-5)
+    motion = Similarity(turn([1, 2, -1], 0.7), np.array([0.1, -0.05, 0.2]), np.ones(()))
+    here = (motion @ (reference.camera_from_mesh @ info.object_from_mesh.inverse()).to_numpy()).to_jax()
+    np.testing.assert_allclose(relative_pose(here, info).to_matrix(), motion.to_matrix(), atol=1e-5)
     # An estimate half as large again at the same place: the rigid motion still takes the centre to the centre.
     large = similarity(here.rotation, here.translation, 1.5 * float(here.scale))
     told = tell_relative_pose(large, info)
     assert told["scale_m_per_reference_unit"] == pytest.approx(1.5, rel=1e-5) and told["reference_unit"] == "m"
-    np.testing.assert_allclose(told["rigid_motion"][:3], np.column_stack(motion)[:, :], atol=1e-5)
+    np.testing.assert_allclose(told["rigid_motion"], motion.to_matrix(), atol=1e-5)
     assert told["rotation_degrees"] == pytest.approx(np.degrees(0.7), abs=1e-3)
     assert "camera_from_reference_camera" in CONVENTIONS
 

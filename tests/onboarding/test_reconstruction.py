@@ -151,9 +151,7 @@ def test_a_real_crop_comes_out_closed_and_of_its_size(shared):
     mask = cv2.imread(str(folder / "mask_visib" / "000002_000002.png"), -1) > 0  # the mustard bottle
     depth = cv2.imread(str(folder / "depth" / "000002.png"), -1) * camera["depth_scale"] * 1e-3
     K = np.reshape(camera["cam_K"], (3, 3))
-    lens = Camera(
-        focal=jnp.asarray([K[0, 0], K[1, 1]], jnp.float32), centre=jnp.asarray([K[0, 2], K[1, 2]], jnp.float32)
-    )
+    lens = Camera.from_matrix(K)
     made = inflation.complete_depth(rgb, mask, depth, lens)
     assert _solid(made.mesh).is_watertight
     longest = np.linalg.norm(np.ptp(made.mesh.vertices, axis=0))
