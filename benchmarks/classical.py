@@ -224,7 +224,7 @@ def unproject(frame: Frame, mask: np.ndarray | None) -> np.ndarray:
         middle = np.median(z)
         keep = np.abs(z - middle) < 5 * np.median(np.abs(z - middle)) + 0.02
         x, y, z = x[keep], y[keep], z[keep]
-    return cameras.unproject(frame.camera, np.stack([x, y], axis=-1), z)
+    return cameras.unproject(frame.camera, np.stack([x, y], axis=-1).astype(np.float64), z)
 
 
 def diameter(vertices: np.ndarray) -> float:

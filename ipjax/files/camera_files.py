@@ -164,10 +164,10 @@ def as_intrinsics(camera: Any) -> Intrinsics:
     if isinstance(camera, Intrinsics):
         return camera
     if isinstance(camera, Camera):
-        focal, centre = np.asarray(camera.focal, np.float64), np.asarray(camera.centre, np.float64)
-        if focal.shape != (2,):
-            raise ValueError(f"frame takes one camera, not a batch of shape {focal.shape[:-1]}")
-        return Intrinsics(_matrix_of(*focal, *centre))
+        matrix = camera.to_matrix()
+        if matrix.ndim != 2:
+            raise ValueError(f"frame takes one camera, not a batch of shape {matrix.shape[:-2]}")
+        return Intrinsics(matrix)
     if isinstance(camera, dict):
         return read_camera(camera)
     array = _numbers(camera, "the camera")

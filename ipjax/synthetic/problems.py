@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from ipjax.cameras import middle
+from ipjax.cameras import middle, unproject
 from ipjax.estimation.features import describe
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Appearance, Camera, Patches, Query, Similarity, Surface, Templates, View
@@ -65,18 +65,18 @@ def picture(
     camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colours, depth and mask of the ellipsoid as any pinhole sees it, exact at every pixel's centre."""
-    rotation = np.asarray(camera_from_object.rotation, np.float64)
-    translation = np.asarray(camera_from_object.translation, np.float64)
-    scale = float(camera_from_object.scale)
+    pose = camera_from_object.to_numpy()
+    translation, scale = pose.translation, float(pose.scale)
     # Only pixels that the sphere around it can reach are worth a ray.
     reach = 0.5 * scale / (translation[2] - 0.5 * scale) * (1 + np.abs(translation[:2]).max() / translation[2])
     middle = translation[:2] / translation[2]
     low = np.clip(np.floor((middle - reach) * focal + centre), 0, [width, height]).astype(int)
     high = np.clip(np.ceil((middle + reach) * focal + centre) + 1, 0, [width, height]).astype(int)
     columns, rows = np.meshgrid(np.arange(low[0], high[0]), np.arange(low[1], high[1]))
-    rays = np.stack([(columns - centre[0]) / focal[0], (rows - centre[1]) / focal[1], np.ones_like(rows)], -1)
-    origin = -(rotation.T @ translation) / scale / AXES
-    direction = (rays @ rotation) / scale / AXES
+    rays = unproject(_matrix(focal, centre), np.stack([columns, rows], -1).astype(float), np.ones(rows.shape))
+    object_from_camera = pose.inverse()
+    origin = object_from_camera.translation / AXES
+    direction = object_from_camera.scale * (rays @ pose.rotation) / AXES
     a, b, c = (direction**2).sum(-1), (direction * origin).sum(-1), (origin**2).sum() - 1
     root = b**2 - a * c
     hit = root > 0
@@ -120,19 +120,20 @@ def make_frame(seed: int, height: int = 480, width: int = 640, share: tuple[floa
     )
     rgb, depth, mask = picture(truth, focal, centre, height, width)
     depth[~mask] = distance + 1.5 * scale
-    matrix = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
+    matrix = _matrix(focal, centre)
     return Frame(np.round(255 * rgb).astype(np.uint8), depth.astype(np.float32), mask, matrix, truth)
 
 
 def outline(camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray) -> Float[np.ndarray, "3 3"]:
     """The conic that the ellipsoid's silhouette is in the image: x̃ᵀ C x̃ = 0, negative inside."""
     # In the object's frame the dual quadric is diag(a², b², c², −1); a camera projects it to the dual conic.
-    rotation = np.asarray(camera_from_object.rotation, np.float64) * float(camera_from_object.scale)
-    projection = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]]) @ np.concatenate(
-        [rotation, np.asarray(camera_from_object.translation, np.float64)[:, None]], axis=1
-    )
+    projection = _matrix(focal, centre) @ camera_from_object.to_numpy().to_matrix()[:3]
     conic = np.linalg.inv(projection @ np.diag([*AXES**2, -1]) @ projection.T)
     return conic * np.sign(conic[0, 0])
+
+
+def _matrix(focal: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    return np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1]])
 
 
 def make_surface(count: int) -> Surface:
@@ -156,7 +157,7 @@ def make_templates(directions: int = 8, rolls: int = 1, grid: int = 8, channels:
         pose = jax.tree.map(lambda x, index=index: np.asarray(x)[index], poses)
         view = see(pose, grid * PATCH)
         found = described(encoder, view)
-        inside = jnp.asarray((np.asarray(found.points) - pose.translation) @ pose.rotation)
+        inside = pose.inverse() @ found.points
         patches.append(eqx.tree_at(lambda p: p.points, found, inside))
         views.append(view.camera)
     return Templates(

@@ -15,10 +15,11 @@ from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from scipy.spatial import ConvexHull
 
-from ipjax.cameras import middle, project, resize_pixels
+from ipjax.cameras import middle, project, resize_pixels, unproject
 from ipjax.files.meshes.mesh import Mesh, make_mesh, normalise
 from ipjax.records import Camera, Similarity
 from ipjax.rendering.render import render_scene
+from ipjax.transforms import rotation_from_vector
 
 WIDTH, HEIGHT = 640, 480
 TEXTURE = 512  # texels on a side
@@ -518,8 +519,8 @@ def _place(
         area = _areas(hull.points, hull.simplices)
         side = rng.choice(len(area), p=area / area.sum())
         angle = rng.uniform(0, 2 * np.pi)
-        spin = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-        rotation = spin @ _rotate_onto(hull.equations[side, :3], np.array([0.0, 0, -1]))
+        rotation = _rotate_onto(hull.equations[side, :3], np.array([0.0, 0, -1]))
+        rotation = rotation_from_vector(np.array([0, 0, angle])) @ rotation
         corners = diameter * hull.points[hull.vertices] @ rotation.T
         shadow = corners[ConvexHull(corners[:, :2]).vertices, :2]
         offset = rng.uniform(-0.02, 0.02, 2)
@@ -581,9 +582,8 @@ def _look(rng: np.random.Generator, target: np.ndarray) -> Similarity[np.ndarray
     right = np.cross(ahead, [0.0, 0, 1])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(ahead, right), ahead])
-    roll = rng.normal(0, 0.12)
-    rotation = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]) @ rotation
-    return Similarity(rotation, -rotation @ position, np.ones(()))
+    rotation = rotation_from_vector(np.array([0, 0, rng.normal(0, 0.12)])) @ rotation
+    return Similarity(rotation.T, position, np.ones(())).inverse()
 
 
 def _visible_share(clouds: Sequence[np.ndarray], camera_from_world: Similarity[np.ndarray], camera: Camera) -> float:
@@ -667,8 +667,8 @@ def _sense(rng: np.random.Generator, depth: np.ndarray, camera: Camera, sensor: 
     rows, columns = np.mgrid[:height, :width]
     rise, run = np.gradient(depth.astype(np.float64), axis=0), np.gradient(depth.astype(np.float64), axis=1)
     # The normal of z(u, v) seen by a pinhole: tangents along u and v, crossed.
-    (fx, fy), (cx, cy) = np.asarray(camera.focal, float), np.asarray(camera.centre, float)
-    rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones((height, width))], -1)
+    fx, fy = np.asarray(camera.focal, float)
+    rays = unproject(camera.to_matrix(), np.stack([columns, rows], -1).astype(float), np.ones((height, width)))
     along_u = rays * run[..., None] + depth[..., None] * [1 / fx, 0, 0]
     along_v = rays * rise[..., None] + depth[..., None] * [0, 1 / fy, 0]
     normal = np.cross(along_u, along_v)
