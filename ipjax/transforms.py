@@ -108,7 +108,7 @@ class Similarity(eqx.Module, Generic[A]):
         xp = _namespace(matrix)
         linear = matrix[..., :3, :3]
         scale = _array(xp.sqrt(xp.sum(linear * linear, axis=(-2, -1)) / 3))
-        if xp is np:
+        if isinstance(matrix, np.ndarray):
             _check_matrix(matrix, scale)
         return Similarity(linear / scale[..., None, None], matrix[..., :3, 3], scale)
 
@@ -228,7 +228,7 @@ def _check_step(step: Any) -> None:
         raise ValueError(f"a tangent has 7 numbers, or 6 without the scale, not {step.shape[-1]}")
 
 
-def _check_matrix(matrix: np.ndarray, scale: np.ndarray) -> None:
+def _check_matrix(matrix: np.ndarray, scale: Any) -> None:
     """Raise ValueError for matrices that are no similarities."""
     if not np.isfinite(matrix).all():
         raise ValueError("the matrix is not finite")
