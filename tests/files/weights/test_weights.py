@@ -23,6 +23,7 @@ from safetensors.numpy import save_file
 
 from ipjax.files.weights import encoders as weights
 from ipjax.files.weights.encoders import CATALOGUE, Source, WeightsError, fill, official_shapes, rename, resolve
+from ipjax.files.weights.matching import load_matching_encoder
 from ipjax.files.weights.onnx import read_onnx
 from ipjax.files.weights.pickles import read_pth
 from ipjax.networks.dinov2 import DinoV2Config, find_preset
