@@ -20,7 +20,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from ipjax_kernels.neighbours import nearest
+from scipy.spatial.transform import Rotation
 
 from benchmarks import neighbours, stages
 from benchmarks.measure import commit, compile_fresh, describe_device, summarise
@@ -62,17 +63,50 @@ class Session:
         self.seconds = 0.2 if quick else 1.0
         self.batches = (2,) if quick else BATCHES
         self.staged = 2 if quick else STAGED
-        templates = problems.make_templates(*((8, 1) if quick else (40, 10)), grid=self.grid, channels=self.channels)
-        narrow = templates.patches.features.astype(jnp.float16)
-        templates = eqx.tree_at(lambda t: t.patches.features, templates, narrow)
-        self.templates = compact(
-            dataclasses.replace(
-                templates,
-                surface=problems.make_surface(512 if quick else 2048),
-                appearance=problems.make_appearance(4096 if quick else 65536),
-            )
-        )
-        self.encoder = problems.make_encoder(self.channels)
+        with jax.default_device(jax.devices("cpu")[0]):
+            views = (8, 1) if quick else (40, 10)
+            templates = problems.make_templates(*views, grid=self.grid, channels=self.channels)
+            narrow = templates.patches.features.astype(jnp.float16)
+            templates = eqx.tree_at(lambda t: t.patches.features, templates, narrow)
+            surface, appearance = problems.make_surface(2048), problems.make_appearance(4096 if quick else 65536)
+            self.templates = compact(dataclasses.replace(templates, surface=surface, appearance=appearance))
+            self.encoder = problems.make_encoder(self.channels)
+            count = 3 if quick else ANSWERS
+            made = [problems.make_query(seed, self.grid, self.channels, noise=NOISE) for seed in range(count)]
+        stack = lambda *x: jnp.stack([np.asarray(part) for part in x])
+        self.queries, self.truth = (jax.tree.map(stack, *part) for part in zip(*made, strict=True))
+        self.keys = jax.random.split(jax.random.key(0), count)
+        # Made on the processor: thousands of tiny programs are nothing for an accelerator.
+        on_host = jax.tree.map(np.asarray, (self.templates, self.encoder))
+        self.templates, self.encoder = jax.tree.map(jnp.asarray, on_host)
+        self.pool, self.jobs = ThreadPoolExecutor(os.cpu_count()), []
+
+    def compile(self, forms: "Forms") -> dict[Any, Future]:
+        """Trace every function, and have it compiled by threads, as many as there are processors.
+
+        Each result is the compiled function, the seconds of its own tracing and compiling, beside the others', and the
+        bytes of its temporary arrays.
+        """
+
+        def build(lowered, seconds):
+            start = time.perf_counter()
+            compiled = lowered.compile()
+            seconds += time.perf_counter() - start
+            memory = compiled.memory_analysis()
+            return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1
+
+        found = {}
+        for key, (function, arguments) in forms.items():
+            start = time.perf_counter()
+            # A function of its own: what was compiled before is found again otherwise.
+            lowered = jax.jit(lambda *a, function=function: function(*a)).lower(*arguments)
+            found[key] = self.pool.submit(build, lowered, time.perf_counter() - start)
+        self.jobs += found.values()
+        return found
+
+    def wait(self) -> None:
+        """Until nothing is compiled any more, so that times are of the device alone."""
+        wait(self.jobs)
 
     def load_dinov2(self, dtype: str) -> Encoder:
         """The encoder of the given weights, or of random ones."""
@@ -82,34 +116,32 @@ class Session:
         shape = tiny if self.quick else find_preset(PRESET, dtype)
         return Encoder(DinoV2(shape, rngs=nnx.Rngs(0)), min(BLOCK, shape.depth - 1))
 
-    def queries(self, count: int):
-        """``count`` of them, stacked, their keys, and the truth of each."""
-        made = [problems.make_query(seed, self.grid, self.channels, noise=NOISE) for seed in range(count)]
-        queries, truth = (jax.tree.map(lambda *x: jnp.stack(x), *part) for part in zip(*made, strict=True))
-        return queries, jax.random.split(jax.random.key(0), count), truth
-
-    def repeated(self, count: int):
-        """``count`` queries, of few different ones: times need no others."""
-        queries, keys, _ = self.queries(min(count, ANSWERS))
+    def some(self, count: int):
+        """So many queries and their keys; one alone has no axis. They repeat: times need no others."""
+        if count == 1:
+            return take(self.queries, 0), self.keys[0]
         resize = lambda x: jnp.resize(x, (count, *x.shape[1:]))
-        return jax.tree.map(resize, queries), keys[np.arange(count) % len(keys)]
+        return jax.tree.map(resize, self.queries), self.keys[np.arange(count) % len(self.keys)]
+
+
+Forms = dict[Any, tuple[Callable, tuple]]
 
 
 def answers(session: Session) -> Iterator[dict[str, Any]]:
     """How far the poses found here are from the truth, and from those of the answers' file."""
-    queries, keys, truth = session.queries(3 if session.quick else ANSWERS)
-    arguments = session.encoder, session.templates, queries, keys, Config()
-    single, seconds, temporary = compile_fresh(
-        estimate, *(take(x, 0) if i in (2, 3) else x for i, x in enumerate(arguments))
-    )
-    print(f"  estimate compiled in {seconds:.0f} s", flush=True)
-    yield {"what": "estimate, compilation", "seconds": seconds, "temporary_bytes": temporary}
-    found = [single(session.encoder, session.templates, take(queries, i), keys[i], Config()) for i in range(len(keys))]
-    found = jax.tree.map(lambda *x: np.stack(x), *found)
-    again = single(session.encoder, session.templates, take(queries, 0), keys[0], Config())
+    truth, keys = session.truth, session.keys
+    arguments = session.encoder, session.templates, session.queries, keys, Config()
+    calls = [(*arguments[:2], take(session.queries, i), keys[i], Config()) for i in range(len(keys))]
+    single, seconds, temporary = compile_fresh(estimate, *calls[0])
+    yield {"what": "estimate, compiled alone", "seconds": seconds, "temporary_bytes": temporary}
+    job = session.compile({"all": (jax.vmap(estimate, MAPPED), arguments)})["all"]
+    yield READY
+    found = jax.tree.map(lambda *x: np.stack(x), *[single(*call) for call in calls])
+    again = single(*calls[0])
     same = all(np.array_equal(x[0], y) for x, y in zip(*map(jax.tree.leaves, (found, again)), strict=True))
     yield {"what": "the same call once more", "identical": same}
-    together = jax.jit(jax.vmap(estimate, MAPPED))(*arguments)
+    yield {"what": "estimate"} | time_call(lambda: single(*calls[0]), session.seconds, 1)
+    together = job.result()[0](*arguments)
     poses = {"one by one": found, "all at once": together, "truth": truth}
     poses = {name: getattr(pose, "camera_from_object", pose) for name, pose in poses.items()}
     confidence = {"one by one": found.confidence, "all at once": together.confidence}
@@ -132,7 +164,7 @@ def answers(session: Session) -> Iterator[dict[str, Any]]:
                     "what": f"{name}, from {other}",
                     **differences(poses[name], poses[other], confidence, name, other),
                 }
-    yield from features(session, queries.view.rgb[:4])
+    yield from features(session, session.queries.view.rgb[:4])
 
 
 def features(session: Session, images) -> Iterator[dict[str, Any]]:
@@ -154,6 +186,7 @@ def features(session: Session, images) -> Iterator[dict[str, Any]]:
             yield {"what": f"features in {name}, from {other}", "error": error, "least_cosine": least}
 
 
+READY: dict[str, Any] = {}  # what a part yields when all that it needs is being compiled
 MAPPED = (None, None, 0, 0, None)
 PAIRS = {("one by one", "truth"), ("the file's", "truth"), ("all at once", "one by one"), ("one by one", "the file's")}
 
@@ -194,44 +227,41 @@ def differences(poses, others, confidence, name, other) -> dict[str, float]:
 def queries(session: Session) -> Iterator[dict[str, Any]]:
     """Estimates of one query and of many; without an encoder nothing is drawn."""
     forms = {}
-    configs = {"Config()": Config(), "Config.fast()": Config.fast(), "Config.paper()": Config.paper()}
     for batch in (1, *session.batches):
-        for name, config in configs.items():
-            for encoder in (session.encoder, None):
-                drawn = encoder is not None
-                # One form is timed at every size, the others once alone and once in the middle.
-                if (drawn and name == "Config()") or (batch in (1, STAGED) and not (drawn and name != "Config()")):
-                    forms[name, drawn, batch] = (
-                        estimate_many(batch),
-                        (encoder, session.templates, *some(session, batch), config),
-                    )
-    built = compile_together({key: form for key, form in forms.items()})
-    for (name, drawn, batch), (compiled, seconds, temporary) in built.items():
-        arguments = forms[name, drawn, batch][1]
-        label = f"estimate, {name}{', candidates drawn' if drawn else ''}"
-        row = {"what": label, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
-        yield row | time_call(partial(compiled, *arguments), session.seconds, batch)
-        if session.trace and (name, drawn, batch) == ("Config()", True, 1):
-            with jax.profiler.trace(str(session.trace), create_perfetto_trace=True):
-                for _ in range(2):
-                    jax.block_until_ready(compiled(*arguments))
-
-
-def estimate_many(batch: int) -> Callable:
-    return estimate if batch == 1 else jax.vmap(estimate, MAPPED)
-
-
-def some(session: Session, batch: int):
-    made, keys = session.repeated(batch)
-    return (take(made, 0), keys[0]) if batch == 1 else (made, keys)
+        made = session.some(batch)
+        for name, config, encoder in (
+            ("Config(), candidates drawn", Config(), session.encoder),
+            ("Config()", Config(), None),
+            ("Config.fast()", Config.fast(), None),
+            ("Config.paper()", Config.paper(), None),
+        ):
+            # One form is timed at every size, the others alone.
+            if encoder is not None or batch == 1:
+                function = estimate if batch == 1 else jax.vmap(estimate, MAPPED)
+                forms[f"estimate, {name}", batch] = function, (encoder, session.templates, *made, config)
+    yield from time_forms(session, forms)
+    if session.trace:
+        call = next(iter(forms.values()))
+        compiled = jax.jit(call[0]).lower(*call[1]).compile()
+        jax.block_until_ready(compiled(*call[1]))
+        with jax.profiler.trace(str(session.trace), create_perfetto_trace=True):
+            for _ in range(2):
+                jax.block_until_ready(compiled(*call[1]))
 
 
 def staged(session: Session) -> Iterator[dict[str, Any]]:
     """The stages of `Config()`, each compiled alone; `estimate` refines and scores two rounds of hypotheses."""
     templates, config, forms = session.templates, Config(), {}
-    poses = jax.jit(stages.hypotheses)(templates, *some(session, 1))
+    shapes = jax.eval_shape(stages.hypotheses, templates, *session.some(1))
+    rng, count = np.random.default_rng(0), shapes.scale.shape[0]
+    near = jax.tree.map(lambda x, like: jnp.broadcast_to(x, like.shape), take(session.truth, 0), shapes)
+    turned = Rotation.from_rotvec(rng.normal(0, 0.1, (count, 3))).as_matrix() @ np.asarray(near.rotation)
+    moved = near.translation + 0.03 * near.scale[:, None] * rng.normal(size=(count, 3))
+    poses = dataclasses.replace(
+        near, rotation=jnp.asarray(turned, jnp.float32), translation=jnp.asarray(moved, jnp.float32)
+    )
     for batch in (1, session.staged):
-        made, keys = some(session, batch)
+        made, keys = session.some(batch)
         start = poses
         if batch > 1:
             start = jax.tree.map(lambda x, batch=batch: jnp.broadcast_to(x, (batch, *x.shape)), poses)
@@ -243,9 +273,7 @@ def staged(session: Session) -> Iterator[dict[str, Any]]:
         ):
             axes = tuple(None if x is templates or x is config else 0 for x in arguments)
             forms[name, batch] = stage if batch == 1 else jax.vmap(stage, axes), arguments
-    for (name, batch), (compiled, seconds, temporary) in compile_together(forms).items():
-        row = {"what": name, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
-        yield row | time_call(partial(compiled, *forms[name, batch][1]), session.seconds, batch)
+    yield from time_forms(session, forms)
 
 
 def encoders(session: Session) -> Iterator[dict[str, Any]]:
@@ -255,76 +283,59 @@ def encoders(session: Session) -> Iterator[dict[str, Any]]:
         encoder = session.load_dinov2(dtype)
         both = Both(session.encoder, encoder)
         for batch in (1, session.staged):
-            made, keys = some(session, batch)
-            forms["observe", dtype, batch] = (
-                observe if batch == 1 else jax.vmap(observe, (None, 0)),
-                (encoder, made.view),
-            )
+            made, keys = session.some(batch)
+            one = observe if batch == 1 else jax.vmap(observe, (None, 0))
+            forms[f"observe, {dtype} encoder", batch] = one, (encoder, made.view)
             one = whole if batch == 1 else jax.vmap(whole, (None, None, 0, 0, None, None))
-            forms["whole query, Config()", dtype, batch] = (
-                one,
-                (both, session.templates, made.view, keys, Config(), None),
-            )
-    for (name, dtype, batch), (compiled, seconds, temporary) in compile_together(forms).items():
-        row = {"what": f"{name}, {dtype} encoder", "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
-        yield row | time_call(partial(compiled, *forms[name, dtype, batch][1]), session.seconds, batch)
+            arguments = both, session.templates, made.view, keys, Config(), None
+            forms[f"whole query, Config(), {dtype} encoder", batch] = one, arguments
+    yield from time_forms(session, forms)
+
+
+def time_forms(session: Session, forms: Forms) -> Iterator[dict[str, Any]]:
+    """A row of each, by its name and the number of its queries."""
+    jobs = session.compile(forms)
+    yield READY
+    for (name, batch), job in jobs.items():
+        compiled, seconds, temporary = job.result()
+        row = {"what": name, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
+        yield row | time_call(partial(compiled, *forms[name, batch][1]), session.seconds, batch)
 
 
 def searches(session: Session) -> Iterator[dict[str, Any]]:
     """The kernel's forms; GFLOP/s count the product of all patches."""
-    for views, patches, channels, dtype in [(5, 64, 32, "bfloat16")] if session.quick else SIZES:
-        arguments = neighbours.problem(views, patches, channels)
+    sizes = [(5, 64, 32, "bfloat16")] if session.quick else SIZES
+    jobs = {}
+    for size in sizes:
+        arguments, dtype = neighbours.problem(*size[:3]), size[3]
         forms = {
-            "one large product": partial(neighbours.large_product, dtype=dtype),
             "nearest (xla)": partial(nearest, dtype=dtype, compact=False),
-            "nearest (xla), a third of the query's patches left out": partial(nearest, dtype=dtype),
+            "one large product": partial(neighbours.large_product, dtype=dtype),
         }
         if dtype == "bfloat16":
             forms["nearest (pallas)"] = partial(nearest, dtype=dtype, implementation="pallas")
-        found, base = {}, None
-        built = compile_together({name: (form, arguments) for name, form in forms.items()})
-        for name, (compiled, seconds, temporary) in built.items():
+        jobs[size] = session.compile({name: (form, arguments) for name, form in forms.items()})
+    yield READY
+    for views, patches, channels, dtype in sizes:
+        arguments, found, base = neighbours.problem(views, patches, channels), {}, 1.0
+        where = {"size": f"{views} × {patches}² × {channels}", "dtype": dtype}
+        for name, job in jobs[views, patches, channels, dtype].items():
+            compiled, seconds, temporary = job.result()
             call = partial(compiled, *arguments)
-            if name in ("nearest (xla)", "nearest (pallas)"):
-                found[name] = call()
-            row = {"what": name, "size": f"{views} × {patches}² × {channels}", "dtype": dtype, "compile_s": seconds}
-            row |= time_call(call, session.seconds / 4, 1) | {"temporary_bytes": temporary}
+            row = {"what": name, **where, "compile_s": seconds, "temporary_bytes": temporary}
+            row |= time_call(call, session.seconds / 4, 1)
             row["gflop_per_s"] = 2e-6 * views * patches**2 * channels / row["in_a_row_ms"]
             base = row["in_a_row_ms"] if name == "nearest (xla)" else base
-            yield row | ({"ratio": row["in_a_row_ms"] / base} if base else {})
+            if name in ("nearest (xla)", "nearest (pallas)"):
+                found[name] = call()
+            yield row | {"ratio": row["in_a_row_ms"] / base}
         if len(found) == 2:
             plain, fused = found.values()
-            for index, similarity in ((0, 1), (2, 3)):
-                yield {
-                    "what": f"pallas beside xla, {'to templates' if index == 0 else 'to the query'}",
-                    "size": f"{views} × {patches}² × {channels}",
-                    "dtype": dtype,
-                    "indices_differ": float(np.mean(np.asarray(plain[index] != fused[index]))),
-                    "similarity_most": float(np.max(np.abs(np.asarray(plain[similarity] - fused[similarity])))),
-                }
-
-
-def compile_together(forms: dict[Any, tuple[Callable, tuple]]) -> dict[Any, tuple[Callable, float, int]]:
-    """Every function compiled, in threads as many as there are processors; the seconds are of its own tracing and
-    compiling, beside the others'."""
-
-    def lower(function, arguments):
-        start = time.perf_counter()
-        # A function of its own: what was compiled before is found again otherwise.
-        return jax.jit(lambda *a: function(*a)).lower(*arguments), time.perf_counter() - start
-
-    def compile_one(lowered, before):
-        start = time.perf_counter()
-        compiled = lowered.compile()
-        seconds = before + time.perf_counter() - start
-        memory = compiled.memory_analysis()
-        return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        jobs = {
-            key: pool.submit(compile_one, *lower(function, arguments)) for key, (function, arguments) in forms.items()
-        }
-        return {key: job.result() for key, job in jobs.items()}
+            for index, similarity, side in ((0, 1, "to templates"), (2, 3, "to the query")):
+                differ = float(np.mean(np.asarray(plain[index] != fused[index])))
+                most = float(np.max(np.abs(np.asarray(plain[similarity] - fused[similarity]))))
+                row = {"what": f"pallas beside xla, {side}", **where, "indices_differ": differ}
+                yield row | {"similarity_most": most}
 
 
 def time_call(call: Callable[[], Any], seconds: float, batch: int) -> dict[str, float]:
@@ -430,12 +441,14 @@ def main() -> None:
     print(
         f"{results['device']}, jax {results['jax']}; problems made in {time.perf_counter() - begin:.0f} s", flush=True
     )
-    for part in PARTS:
-        if part not in (options.only or PARTS):
-            continue
-        rows = results["parts"].setdefault(part, [])
-        for row in RUN[part](session):
-            rows.append(row)
+    chosen = [part for part in PARTS if part in (options.only or PARTS)]
+    running = {part: RUN[part](session) for part in chosen}
+
+    def advance(part: str, rows: Iterator[dict[str, Any]]) -> None:
+        for row in rows:
+            if row is READY:
+                return
+            results["parts"].setdefault(part, []).append(row)
             told = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items() if k != "what"}
             print(f"[{time.perf_counter() - begin:4.0f} s] {part}: {row['what']}: {told}", flush=True)
         results["seconds"] = time.perf_counter() - begin
@@ -443,6 +456,14 @@ def main() -> None:
             write_text(options.json, json.dumps(results, indent=1, ensure_ascii=False) + "\n", parents=True)
         if options.page:
             write_text(options.page, render(results), parents=True)
+
+    for part, rows in running.items():
+        advance(part, rows)
+        print(f"[{time.perf_counter() - begin:4.0f} s] {part}: traced", flush=True)
+    session.wait()
+    print(f"[{time.perf_counter() - begin:4.0f} s] everything is compiled", flush=True)
+    for part, rows in running.items():
+        advance(part, rows)
     print("\n" + render(results))
 
 
