@@ -436,7 +436,9 @@ def main() -> None:
     only = "".join(f" --only {part}" for part in options.only or [])
     results: dict[str, Any] = {**describe_device(), "date": time.strftime("%Y-%m-%d"), "quick": options.quick}
     results |= {"commit": options.commit or commit(), "parts": {}}
-    results["command"] = f"python -m benchmarks.accelerator{only}" + " --answers FILE" * bool(options.answers)
+    flags = f"XLA_FLAGS={os.environ['XLA_FLAGS']} " if os.environ.get("XLA_FLAGS") else ""
+    given = " --answers FILE" * bool(options.answers) + " --weights FILE" * bool(options.weights)
+    results["command"] = f"{flags}python -m benchmarks.accelerator{only}{given}"
     session = Session(options.quick, options.answers, options.weights, options.trace)
     print(
         f"{results['device']}, jax {results['jax']}; problems made in {time.perf_counter() - begin:.0f} s", flush=True
