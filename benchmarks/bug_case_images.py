@@ -11,7 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ipjax.files.images import read_camera, read_depth, read_mask, read_rgb
+from ipjax.files.cameras.reading import read_camera
+from ipjax.files.images.depth import read_depth
+from ipjax.files.images.masks import read_mask
+from ipjax.files.images.opening import read_rgb
 from ipjax.inference.frames import frame
 
 SIZE = (640, 480)  # of the images that the cameras and masks were made for

@@ -269,7 +269,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
         if arguments.mask_label is not None:
             if arguments.mask is None:
                 raise ValueError("--mask-label belongs to --mask")
-            from ipjax.files.images import read_mask
+            from ipjax.files.images.masks import read_mask
 
             given["mask"] = read_mask(arguments.mask, arguments.mask_label)
         given["tried"] = output.with_suffix(".tried.png")
@@ -319,7 +319,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
 def _read_photo_camera(arguments: argparse.Namespace) -> Any:
     if arguments.camera is None:
         return None
-    from ipjax.files.camera_files import read_camera
+    from ipjax.files.cameras.reading import read_camera
 
     image = arguments.image
     if image is None and arguments.source.stem.isdigit():
@@ -703,8 +703,10 @@ def _instance(scene: Any, shares: Any, stem: str, number: int, path: Path) -> in
 
 
 def _read_frame(names: dict[str, Any], arguments: argparse.Namespace) -> dict[str, Any]:
-    from ipjax.files.camera_files import read_camera
-    from ipjax.files.images import read_depth, read_mask, read_rgb
+    from ipjax.files.cameras.reading import read_camera
+    from ipjax.files.images.depth import read_depth
+    from ipjax.files.images.masks import read_mask
+    from ipjax.files.images.opening import read_rgb
 
     if "error" in names:
         raise ValueError(names["error"])

@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ipjax.files.images import BYTES_PER_PIXEL, as_mask, read_depth, read_mask, read_rgb, read_size
+from ipjax.files.images.depth import read_depth
+from ipjax.files.images.masks import as_mask, read_mask
+from ipjax.files.images.opening import BYTES_PER_PIXEL, read_rgb, read_size
 from ipjax.files.meshes.mesh import Mesh, load_mesh, move
 from ipjax.files.storage.budget import check_budget
 from ipjax.files.storage.parsing import read_json

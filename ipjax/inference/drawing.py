@@ -14,7 +14,7 @@ from ipjax.cameras import project, resize, resize_pixels
 from ipjax.config import Config
 from ipjax.estimation.matching import match
 from ipjax.estimation.pipeline import comparable
-from ipjax.files.camera_files import as_intrinsics
+from ipjax.files.cameras.reading import as_intrinsics
 from ipjax.files.object_file import ObjectInfo
 from ipjax.files.storage.writing import writing
 from ipjax.inference.reports import UNSURE_TURN

@@ -24,8 +24,11 @@ from ipjax.cameras import (
     turn,
     unproject,
 )
-from ipjax.files.camera_files import Intrinsics, as_intrinsics, list_misfits
-from ipjax.files.images import as_mask, as_native, check_mask, forget_sentinel
+from ipjax.files.cameras.intrinsics import Intrinsics, check_depth_scale, list_misfits
+from ipjax.files.cameras.reading import as_intrinsics
+from ipjax.files.images.arrays import as_native
+from ipjax.files.images.depth import remove_sentinel
+from ipjax.files.images.masks import as_mask, check_mask
 from ipjax.records import Camera, Similarity, View
 
 Background = Literal["black", "grey", "keep"]
@@ -163,7 +166,7 @@ def frame_turned(
             log.warning("the mask has fewer than %d pixels: no pose can be exact", _SMALL)
     for misfit in list_misfits(intrinsics, width, height):
         log.warning("camera: %s", misfit)
-    depth, unknown = forget_sentinel(depth)
+    depth, unknown = remove_sentinel(depth)
     if unknown:
         log.info("%s", unknown)
     scale = _depth_scale(depth, depth_scale, intrinsics)
@@ -319,9 +322,7 @@ def _depth_scale(depth: np.ndarray, depth_scale: float | None, intrinsics: Intri
             median = float(np.median(known)) if known.size else 0.0
             raise ValueError(_unit_in_words(median, "depth of whole numbers has no unit", None))
         scale = 1.0
-    if not (np.isfinite(scale) and scale > 0):
-        raise ValueError(f"depth_scale must be a positive number of metres per depth unit, not {scale}")
-    return float(scale)
+    return check_depth_scale(scale)
 
 
 def _unit_in_words(median: float, else_say: str, scale: float | None) -> str:

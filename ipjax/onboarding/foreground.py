@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageOps
 
 from ipjax.cameras import mostly, resize_pixels
-from ipjax.files.images import as_mask, get_orientation, open_image, read_size
+from ipjax.files.images.masks import as_mask
+from ipjax.files.images.opening import get_orientation, open_image, read_size
 from ipjax.files.storage.writing import writing
 
 MAX_SIDE = 2048  # pixels; larger photos are reduced

@@ -10,8 +10,11 @@ import numpy as np
 
 from ipjax.cameras import resize, resize_pixels
 from ipjax.config import OnboardConfig
-from ipjax.files.camera_files import Intrinsics, as_intrinsics, list_misfits, read_camera
-from ipjax.files.images import as_native, forget_sentinel, read_depth, read_mask
+from ipjax.files.cameras.intrinsics import Intrinsics, list_misfits
+from ipjax.files.cameras.reading import as_intrinsics, read_camera
+from ipjax.files.images.arrays import as_native
+from ipjax.files.images.depth import read_depth, remove_sentinel
+from ipjax.files.images.masks import read_mask
 from ipjax.files.object_file import ObjectInfo, Reference, save
 from ipjax.files.weights.encoders import WeightsError, hash_file
 from ipjax.inference import frames
@@ -187,7 +190,7 @@ def _to_metres(
     depth = as_native(depth)
     if depth.ndim != 2:
         raise ValueError(f"depth has one number per pixel, not the shape {list(depth.shape)}")
-    depth, unknown = forget_sentinel(depth)
+    depth, unknown = remove_sentinel(depth)
     if unknown:
         log.info("%s", unknown)
     height, width = mask.shape

@@ -11,7 +11,11 @@ from hypothesis import given
 from PIL import Image
 
 from benchmarks.bias import frame_errors, summary
-from ipjax.files.images import Intrinsics, as_mask, read_camera, read_depth, read_mask, read_rgb
+from ipjax.files.cameras.intrinsics import Intrinsics
+from ipjax.files.cameras.reading import read_camera
+from ipjax.files.images.depth import read_depth
+from ipjax.files.images.masks import as_mask, read_mask
+from ipjax.files.images.opening import read_rgb
 from ipjax.inference.frames import clean_depth, frame, frame_turned
 from ipjax.records import Camera
 

@@ -15,7 +15,7 @@ from test_object_file import make_object
 
 from ipjax import cli
 from ipjax.config import OnboardConfig
-from ipjax.files.images import Intrinsics
+from ipjax.files.cameras.intrinsics import Intrinsics
 from ipjax.files.object_file import Reference, check, load, save
 from ipjax.inference.reports import CONVENTIONS, relative_pose, tell_relative_pose
 from ipjax.networks.dinov2 import DinoV2, Encoder

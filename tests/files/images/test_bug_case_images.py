@@ -9,8 +9,10 @@ import re
 import numpy as np
 import pytest
 
-from ipjax.files.camera_files import read_camera
-from ipjax.files.images import read_depth, read_mask, read_rgb
+from ipjax.files.cameras.reading import read_camera
+from ipjax.files.images.depth import read_depth
+from ipjax.files.images.masks import read_mask
+from ipjax.files.images.opening import read_rgb
 from ipjax.inference.frames import frame
 
 K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])

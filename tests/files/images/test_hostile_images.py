@@ -20,9 +20,11 @@ import json, resource, sys
 from pathlib import Path
 from ipjax.bop import dataset as bop
 from ipjax.bop import evaluation
-from ipjax.files.camera_files import read_camera
+from ipjax.files.cameras.reading import read_camera
 from ipjax.onboarding.foreground import read_photo
-from ipjax.files.images import read_depth, read_mask, read_rgb, read_size
+from ipjax.files.images.depth import read_depth
+from ipjax.files.images.masks import read_mask
+from ipjax.files.images.opening import read_rgb, read_size
 from ipjax.files.settings import read_config
 
 def read_rle(path):

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipjax.files.camera_files import Intrinsics, as_intrinsics, list_misfits, read_camera
+from ipjax.files.cameras.intrinsics import Intrinsics, check_depth_scale, list_misfits
+from ipjax.files.cameras.reading import as_intrinsics, read_camera
 
 WIDTH, HEIGHT = 640, 480
 FX, FY, CX, CY = 605.5, 604.25, 322.75, 238.5
@@ -273,3 +274,14 @@ def test_other_misfits_are_told():
     assert "field of view" in told(4000, 4000, 320, 240)
     assert "field of view" in told(150, 150, 320, 240)
     assert "stretched" in told(600, 450, 320, 240)
+
+
+@pytest.mark.parametrize(
+    ("scale", "said"),
+    [("mm", "0.001 for mm"), ("Metres", "1 for Metres"), ("inch", "0.001 for millimetres"), (0, "not 0"), ([1], "not"),
+     (float("nan"), "not nan")],
+)  # fmt: skip
+def test_a_unit_by_its_name_is_refused_with_its_number(scale, said):
+    with pytest.raises(ValueError, match=f"metres per depth unit.*{said}"):
+        check_depth_scale(scale)
+    assert check_depth_scale(np.float32(0.5)) == 0.5

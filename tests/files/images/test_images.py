@@ -11,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from ipjax.files.images import as_mask, forget_sentinel, read_depth, read_mask, read_rgb
+from ipjax.files.images.depth import read_depth, remove_sentinel
+from ipjax.files.images.masks import as_mask, read_mask
+from ipjax.files.images.opening import read_rgb
 from ipjax.inference.frames import frame
 from ipjax.onboarding.foreground import read_photo
 from ipjax.onboarding.photo import take_shot
@@ -252,7 +254,7 @@ def test_a_number_for_unknown_is_not_depth(dtype, sentinel, scale, share, caplog
 @pytest.mark.parametrize("behind", [65535, 2000])
 def test_a_flat_object_before_a_number_for_unknown_is_kept(behind):
     depth = np.where(DISC, 300, behind).astype(np.uint16)
-    kept, said = forget_sentinel(depth)
+    kept, said = remove_sentinel(depth)
     assert (kept[DISC] == 300).all() and not kept[~DISC].any() and said.count("%") == 1
 
 
@@ -270,7 +272,7 @@ def test_depth_that_only_looks_alike_is_kept():
     wall = DEPTH.copy()
     wall[:, 64:] = 1.3  # a wall seen straight on, behind everything
     for depth in (DEPTH, wall, np.minimum(DEPTH, 1.0), (DEPTH * 1000).astype(np.uint16)):
-        kept, said = forget_sentinel(depth)
+        kept, said = remove_sentinel(depth)
         assert kept is depth and said == ""
 
 
