@@ -39,9 +39,9 @@ from benchmarks.queries import BLOCK, PRESET, Both, whole
 from ipjax.config import Config
 from ipjax.estimation.features import observe
 from ipjax.estimation.pipeline import estimate
-from ipjax.files.object_file import compact
 from ipjax.files.storage.writing import write_text, writing
-from ipjax.files.weights.encoders import load_encoder
+from ipjax.files.weights.encoder import load_encoder
+from ipjax.inference.batching import compact
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.synthetic import problems
 

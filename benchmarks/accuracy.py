@@ -21,7 +21,7 @@ from ipjax.bop.dataset import MM, Dataset, read_results
 from ipjax.bop.evaluation import Score, evaluate
 from ipjax.files.settings import read_config
 from ipjax.files.storage.writing import write_text
-from ipjax.files.weights.encoders import load_encoder
+from ipjax.files.weights.encoder import load_encoder
 from ipjax.inference.compilation_cache import use_compilation_cache
 
 

@@ -21,7 +21,7 @@ from ipjax.bop import run as studies
 from ipjax.bop.dataset import MM, Dataset, Estimate, Frame, Target
 from ipjax.bop.evaluation import Alignment, evaluate, read_alignment
 from ipjax.files.meshes.mesh import Mesh, load_mesh
-from ipjax.files.weights.encoders import hash_file
+from ipjax.files.weights.hashes import hash_file
 from ipjax.synthetic.degradation import degrade
 
 INSTALL = "the classical baseline needs Open3D: pip install open3d"

@@ -192,7 +192,7 @@ def run(
 ) -> None:
     """Try every pair by every method; lines already in ``output`` are not tried again."""
     from benchmarks.measure import commit
-    from ipjax.files.weights.encoders import load_encoder
+    from ipjax.files.weights.encoder import load_encoder
     from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.inference.estimator import Estimator
     from ipjax.onboarding.foreground import Photo

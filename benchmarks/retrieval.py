@@ -20,9 +20,10 @@ from ipjax.bop.dataset import Dataset
 from ipjax.config import MatchConfig
 from ipjax.estimation.features import cut, describe, object_features, principal_basis
 from ipjax.estimation.matching import match
-from ipjax.files.object_file import compact, load
+from ipjax.files.objects.loading import load
 from ipjax.files.storage.writing import write_text
-from ipjax.files.weights.encoders import load_encoder
+from ipjax.files.weights.encoder import load_encoder
+from ipjax.inference.batching import compact
 from ipjax.inference.estimator import Estimator
 from ipjax.records import Patches, Templates
 

@@ -14,7 +14,7 @@ from ipjax.estimation.matching import match, select
 from ipjax.estimation.pipeline import SceneGrid, apparent_diameter, comparable, estimate
 from ipjax.estimation.refinement import refine
 from ipjax.estimation.scoring import score
-from ipjax.files.object_file import compact
+from ipjax.inference.batching import compact
 from ipjax.synthetic import problems
 
 BATCHES = (8,)  # queries at once

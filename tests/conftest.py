@@ -38,3 +38,12 @@ def x64():
     """Run a test in float64; the library itself never sets it."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def weights_cache(tmp_path, monkeypatch) -> Path:
+    """A cache of weights of the test's own, not made yet, whatever the environment says."""
+    for name in ("IPJAX_WEIGHTS", "IPJAX_OFFLINE", "HF_HUB_OFFLINE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("IPJAX_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / "weights"

@@ -196,8 +196,8 @@ def test_finds_what_goes_back():
     assert find_faults("from ipjax.estimation.alignment import align", "ipjax.estimation.matching", known)
     assert find_faults("from ipjax import files", "ipjax.estimation.scoring", known)
     assert find_faults("def f():\n    import ipjax.files.meshes.mesh", "ipjax.estimation.features", known)
-    assert find_faults("from ipjax import __version__", "ipjax.files.object_file", known) == []
-    assert find_faults("from ipjax import estimate", "ipjax.files.object_file", known)
+    assert find_faults("from ipjax import __version__", "ipjax.files.objects.loading", known) == []
+    assert find_faults("from ipjax import estimate", "ipjax.files.objects.loading", known)
     assert find_faults("import ipjax", "ipjax.records", known)
     assert find_faults("from ipjax.records import Camera", "ipjax_kernels.similarity", known)
 

@@ -12,7 +12,8 @@ import test_pipeline
 
 import ipjax
 from ipjax.files.meshes.mesh import save_mesh
-from ipjax.files.weights.encoders import WeightsError, resolve
+from ipjax.files.weights.catalogue import WeightsError
+from ipjax.files.weights.finding import resolve
 from ipjax.onboarding import mesh as onboarding
 from ipjax.synthetic import problems
 from ipjax.synthetic.scenes import PERFECT, make_object, make_scene

@@ -19,12 +19,14 @@ from ipjax.bop.dataset import MM, Dataset, DatasetError, Estimate, Frame, Target
 from ipjax.bop.evaluation import Alignment, read_alignment
 from ipjax.config import Config, OnboardConfig
 from ipjax.files.meshes.mesh import load_mesh
-from ipjax.files.object_file import FORMAT, load, save
+from ipjax.files.objects.layout import FORMAT
+from ipjax.files.objects.loading import load
+from ipjax.files.objects.saving import save
 from ipjax.files.provenance import hash_executed
 from ipjax.files.settings import describe_config
 from ipjax.files.storage.cache import cache_folder
 from ipjax.files.storage.writing import write_text
-from ipjax.files.weights.encoders import hash_file
+from ipjax.files.weights.hashes import hash_file
 from ipjax.inference.estimator import Estimator, Result
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.mesh import onboard

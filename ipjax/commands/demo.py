@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from ipjax.config import Config
 from ipjax.files.meshes.mesh import Mesh, sample_surface, save_mesh
-from ipjax.files.object_file import SUFFIX
+from ipjax.files.objects.layout import SUFFIX
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.drawing import draw, gather_evidence, write_image
 from ipjax.inference.estimator import Estimator

@@ -15,7 +15,7 @@ from ipjax.config import Config
 from ipjax.estimation.matching import match
 from ipjax.estimation.pipeline import comparable
 from ipjax.files.cameras.reading import as_intrinsics
-from ipjax.files.object_file import ObjectInfo
+from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import writing
 from ipjax.inference.reports import UNSURE_TURN
 from ipjax.records import PoseEstimate, Query, Similarity, Templates

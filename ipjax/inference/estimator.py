@@ -12,7 +12,8 @@ import numpy as np
 from ipjax.config import Config
 from ipjax.estimation.features import describe
 from ipjax.estimation.pipeline import estimate
-from ipjax.files.object_file import ObjectInfo, compact
+from ipjax.files.objects.record import ObjectInfo
+from ipjax.inference.batching import compact
 from ipjax.inference.frames import frame_turned
 from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ipjax.files.object_file import ObjectInfo
+from ipjax.files.objects.record import ObjectInfo
 from ipjax.records import PoseEstimate, Similarity, Templates
 
 CONVENTIONS = {

@@ -14,8 +14,10 @@ from jaxtyping import Array, Float, UInt8
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.estimation.features import centre, check_cut, cut, describe, principal_basis
 from ipjax.files.meshes.mesh import Mesh, clean, load_mesh, normalise, sample_appearance, sample_surface, sample_texture
-from ipjax.files.object_file import ObjectInfo, save
-from ipjax.files.weights.encoders import hash_file, load_encoder
+from ipjax.files.objects.record import ObjectInfo
+from ipjax.files.objects.saving import save
+from ipjax.files.weights.encoder import load_encoder
+from ipjax.files.weights.hashes import hash_file
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.progress import bar

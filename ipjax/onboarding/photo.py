@@ -15,8 +15,10 @@ from ipjax.files.cameras.reading import as_intrinsics, read_camera
 from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import read_depth, remove_sentinel
 from ipjax.files.images.masks import read_mask
-from ipjax.files.object_file import ObjectInfo, Reference, save
-from ipjax.files.weights.encoders import WeightsError, hash_file
+from ipjax.files.objects.record import ObjectInfo, Reference
+from ipjax.files.objects.saving import save
+from ipjax.files.weights.catalogue import WeightsError
+from ipjax.files.weights.hashes import hash_file
 from ipjax.inference import frames
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo

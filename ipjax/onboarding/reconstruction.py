@@ -11,14 +11,11 @@ from jaxtyping import Float
 
 from ipjax.files.meshes.mesh import Mesh, make_mesh
 from ipjax.files.storage.cache import cache_folder
-from ipjax.files.weights.encoders import (
-    Resolved,
-    Source,
-    WeightsError,
-    download_file,
-    is_offline,
-    recall_hash,
-)
+from ipjax.files.weights.catalogue import Source, WeightsError
+from ipjax.files.weights.downloading import download_file
+from ipjax.files.weights.finding import is_offline
+from ipjax.files.weights.found import Resolved
+from ipjax.files.weights.hashes import recall_hash
 from ipjax.onboarding.reconstructed import Reconstruction
 from ipjax.records import Camera, Similarity
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from ipjax.config import OnboardConfig
 from ipjax.files.meshes.mesh import Mesh, make_mesh
-from ipjax.files.object_file import ObjectInfo
+from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import write_text
 from ipjax.networks.dinov2 import Encoder
 from ipjax.records import Similarity, Templates
@@ -551,7 +551,7 @@ def _facts(templates: Templates, info: ObjectInfo, found: Findings) -> list[tupl
 
 
 def _licences(info: ObjectInfo) -> list[tuple[str, str]]:
-    from ipjax.files.weights.encoders import CATALOGUE
+    from ipjax.files.weights.catalogue import CATALOGUE
     from ipjax.onboarding.reconstruction import TRIPOSR
 
     digest = info.encoder.rpartition("sha256:")[2]

@@ -12,14 +12,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.objects import make_object, nan, rewrite
 from estimates import make_estimate
 from PIL import Image
-from test_object_file import make_object, nan, rewrite
 
 from ipjax import cli
 from ipjax.cameras import point_map
 from ipjax.estimation.features import describe
-from ipjax.files.object_file import load, save
+from ipjax.files.objects.loading import load
+from ipjax.files.objects.saving import save
 from ipjax.inference.reports import tell_estimate, to_json
 from ipjax.records import Camera, Patches, PoseEstimate, Similarity, Surface, Templates, View
 
@@ -166,7 +167,7 @@ def test_another_encoders_object_file_is_refused(case, capfd, monkeypatch):
 )
 def test_bad_meshes_are_refused_in_one_line(case, capfd, monkeypatch, content, words):
     encoder = SimpleNamespace(identity="none")
-    monkeypatch.setattr("ipjax.files.weights.encoders.load_encoder", lambda *_, **__: encoder)
+    monkeypatch.setattr("ipjax.files.weights.encoder.load_encoder", lambda *_, **__: encoder)
     monkeypatch.setattr("ipjax.cli._load_encoder", lambda _: encoder)
     monkeypatch.setattr("ipjax.onboarding.mesh.make_templates", lambda *_, **__: pytest.fail("a bad mesh was rendered"))
     if content is not None:

@@ -11,7 +11,7 @@ from test_pipeline import TINY
 
 import ipjax
 from ipjax.estimation.features import identity_of
-from ipjax.files.weights.encoders import abstract_model
+from ipjax.files.weights.parameters import abstract_model
 from ipjax.inference.exporting import to_dictionary
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder
 from ipjax.records import Query

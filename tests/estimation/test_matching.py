@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ipjax.config import Config, MatchConfig
 from ipjax.estimation.matching import match, resemblance, select
-from ipjax.files.object_file import compact
+from ipjax.inference.batching import compact
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Camera, Patches, Similarity, Surface, Templates
 from ipjax.synthetic import problems

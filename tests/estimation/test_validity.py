@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.objects import make_object
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.numpy import save_file
-from test_object_file import make_object
 from test_pipeline import DRAWN, make_sized_query, two_objects
 
 import ipjax
@@ -20,7 +20,8 @@ from ipjax.estimation.features import describe
 from ipjax.estimation.matching import match, select
 from ipjax.estimation.pipeline import comparable
 from ipjax.estimation.validity import finite_patches, finite_query, finite_templates
-from ipjax.files.object_file import load, save
+from ipjax.files.objects.loading import load
+from ipjax.files.objects.saving import save
 from ipjax.inference.frames import frame
 from ipjax.synthetic import problems
 

@@ -12,13 +12,14 @@ import cv2
 import numpy as np
 import own_memory
 import pytest
-from test_object_file import make_object
-from test_weights import Program, field, onnx_tensor, state_dict, write_pth
+from builders.objects import make_object
+from builders.weight_files import Program, field, onnx_tensor, state_dict, write_pth
 
-from ipjax.files import object_file as objects
-from ipjax.files.object_file import load, save
+from ipjax.files.objects.loading import load
+from ipjax.files.objects.pictures import LARGEST_SIDE, PICTURE_SIDE
+from ipjax.files.objects.saving import save
 from ipjax.files.storage.budget import check_tensors, read_safetensors_header
-from ipjax.files.weights.encoders import read_weights
+from ipjax.files.weights.reading import read_weights
 
 MEGABYTE = 2**20
 LARGE = 2**18  # numbers in a megabyte
@@ -80,8 +81,8 @@ HOSTILE = [
 
 READ = """
 import json, resource, sys
-from ipjax.files.object_file import load
-from ipjax.files.weights.encoders import read_weights
+from ipjax.files.objects.loading import load
+from ipjax.files.weights.reading import read_weights
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform != "darwin" else 2**20)
 for path in sys.argv[1:]:
     before = peak()
@@ -148,4 +149,4 @@ def test_a_picture_that_promises_much_is_none(tmp_path):
     _, again = load(save(tmp_path / "mug.ipjax", templates, told))
     assert again.picture(0) is None and again.picture(1) is None
     assert again.picture(2).shape == (16, 16, 3) and abs(int(again.picture(2).mean()) - 90) < 3
-    assert objects._PICTURE < objects._LARGEST
+    assert PICTURE_SIDE < LARGEST_SIDE

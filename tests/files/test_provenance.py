@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.objects import make_object
 from PIL import Image
 from test_layers import MODULES
-from test_object_file import make_object
 
 from ipjax.bop import run as studies
 from ipjax.config import OnboardConfig
 from ipjax.files.meshes.mesh import make_mesh, save_mesh
-from ipjax.files.object_file import load, save
+from ipjax.files.objects.loading import load
+from ipjax.files.objects.saving import save
 from ipjax.files.provenance import PACKAGES, find_packages, hash_executed, list_executed
-from ipjax.files.weights.encoders import abstract_model
+from ipjax.files.weights.parameters import abstract_model
 from ipjax.networks.dinov2 import DinoV2Config, Encoder
 
 

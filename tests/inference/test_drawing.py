@@ -9,7 +9,7 @@ import trimesh
 from estimates import make_estimate
 from PIL import Image
 
-from ipjax.files.object_file import ObjectInfo
+from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.drawing import Evidence, draw, draw_overlay, silhouette, write_image
 from ipjax.records import Similarity
 

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from estimates import make_estimate
 
-from ipjax.files.object_file import ObjectInfo, compact
+from ipjax.files.objects.record import ObjectInfo
+from ipjax.inference.batching import compact
 from ipjax.inference.estimator import MULTIPLE, Estimator, _turn
 from ipjax.inference.exporting import blank_query
 from ipjax.records import Patches, Query, Similarity

@@ -13,7 +13,7 @@ from flax import nnx
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipjax.files.weights.encoders import fill, official_shapes
+from ipjax.files.weights.parameters import build_model, official_shapes
 from ipjax.networks import dinov2
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, encode, tokens
 
@@ -43,14 +43,14 @@ def golden(path: Path) -> dict[str, np.ndarray]:
 def golden_model(path: Path, variant: str, dtype: str = "float32") -> DinoV2:
     weights = {name[2:]: array for name, array in golden(path).items() if name.startswith("w/")}
     depth = 1 + max(int(name.split(".")[1]) for name in weights if name.startswith("blocks."))
-    return fill(tiny(variant, depth, dtype=dtype), weights)
+    return build_model(tiny(variant, depth, dtype=dtype), weights)
 
 
 def random_model(config: DinoV2Config, seed: int = 0) -> DinoV2:
     """Random weights without compiling anything."""
     draw = np.random.default_rng(seed)
     shapes = official_shapes(config)
-    return fill(config, {name: draw.normal(0, 0.1, shape).astype(np.float32) for name, shape in shapes.items()})
+    return build_model(config, {name: draw.normal(0, 0.1, shape).astype(np.float32) for name, shape in shapes.items()})
 
 
 @jax.jit

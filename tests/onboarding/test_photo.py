@@ -8,15 +8,17 @@ import re
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.objects import make_object
 from flax import nnx
 from PIL import Image
 from test_dinov2 import tiny
-from test_object_file import make_object
 
 from ipjax import cli
 from ipjax.config import OnboardConfig
 from ipjax.files.cameras.intrinsics import Intrinsics
-from ipjax.files.object_file import Reference, check, load, save
+from ipjax.files.objects.loading import check, load
+from ipjax.files.objects.record import Reference
+from ipjax.files.objects.saving import save
 from ipjax.inference.reports import CONVENTIONS, relative_pose, tell_relative_pose
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.onboarding import photo as photos

@@ -12,7 +12,7 @@ from flax import nnx
 from golden.make_triposr import unpack
 
 from ipjax.files.meshes.mesh import sample_texture
-from ipjax.files.weights.encoders import WeightsError
+from ipjax.files.weights.catalogue import WeightsError
 from ipjax.networks import triposr
 from ipjax.onboarding import inflation, reconstruction
 from ipjax.onboarding.foreground import Photo, find_foreground

@@ -56,7 +56,7 @@ class Intrinsics:
             raise ValueError("the principal point is (0, 0), the image's corner: cx and cy are missing")
         lens, distortion = check_lens(self.lens, self.distortion)
         if self.depth_scale is not None:
-            check_depth_scale(self.depth_scale)
+            check_depth_scale(self.depth_scale, "the depth scale")
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "lens", lens)
         object.__setattr__(self, "distortion", distortion)
@@ -67,8 +67,8 @@ class Intrinsics:
         return Camera.from_matrix(self.matrix)
 
 
-def check_depth_scale(scale: Any) -> float:
-    """Metres per unit of a depth image, as a float.
+def check_depth_scale(scale: Any, what: str = "depth_scale") -> float:
+    """Metres per unit of a depth image, as a float; ``what`` begins the message.
 
     Raises:
         ValueError: no positive number, for instance the name of a unit; the message says which number it has.
@@ -82,7 +82,7 @@ def check_depth_scale(scale: Any) -> float:
     units = {"m": 1, "metre": 1, "meter": 1, "mm": 0.001, "millimetre": 0.001, "millimeter": 0.001, "cm": 0.01}
     number = units.get(scale.strip().lower().rstrip("s")) if isinstance(scale, str) else None
     meant = "0.001 for millimetres, 1 for metres" if number is None else f"{number:g} for {scale}"
-    raise ValueError(f"depth_scale must be a positive number of metres per depth unit ({meant}), not {scale!r}")
+    raise ValueError(f"{what} must be a positive number of metres per depth unit ({meant}), not {scale!r}")
 
 
 def list_misfits(intrinsics: Intrinsics, width: int, height: int) -> list[str]:

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ipjax.files.weights.encoders import find_by_hash, list_weights, load_encoder
+from ipjax.files.weights.encoder import load_encoder
+from ipjax.files.weights.finding import find_by_hash
+from ipjax.files.weights.found import list_weights
 
 
 def load_matching_encoder(

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from test_weights import Server, serving
+from builders.weight_server import Server, serving
 
 
 @pytest.fixture
@@ -26,8 +26,8 @@ def fetch(server: Server, cache: Path) -> subprocess.Popen:
     known = {"sha256": hashlib.sha256(server.data).hexdigest(), "url": server.url}
     code = f"""
 import sys
-from ipjax.files.weights import encoders as weights
-weights.CATALOGUE["test"] = weights.Source("test", "vits14", "weights.pth", "none", **{json.dumps(known)})
+from ipjax.files.weights import catalogue
+catalogue.CATALOGUE["test"] = catalogue.Source("test", "vits14", "weights.pth", "none", **{json.dumps(known)})
 from ipjax.cli import main
 sys.exit(main(["weights", "fetch", "test"]))
 """

@@ -1,0 +1,1 @@
+"""The object file: an onboarded object as one portable file."""

@@ -1,0 +1,114 @@
+"""Templates with fewer patches, and of one size for several objects, so that one program estimates them all."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ipjax.records import Templates
+
+
+def compact(templates: Templates, *, multiple: int = 32) -> Templates:
+    """Templates with fewer patches each, and the same answers: most of an image is background.
+
+    The valid patches come first, in their old order, then as many others as make all templates alike: a multiple of
+    ``multiple``. At least one of the others stays, the last of the grid unless that is valid, so that ``grid`` still
+    tells how large it is. To be done once, before ``estimate``; an object file keeps every patch.
+
+    Raises:
+        ValueError: the templates are no single object's, or ``multiple`` is not positive.
+    """
+    valid = np.asarray(templates.patches.valid)
+    if valid.ndim != 2 or multiple < 1:
+        raise ValueError(f"compact takes one object's templates and a positive multiple, not {valid.shape}, {multiple}")
+    views, patches = valid.shape
+    count = multiple * (int(valid.sum(axis=1).max()) // multiple + 1)
+    if count >= patches:
+        return templates
+    place = np.where(valid, np.arange(patches), 2 * patches - np.arange(patches))
+    chosen = np.argsort(place, axis=1)[:, :count]
+    take = lambda x: jnp.asarray(np.asarray(x)[np.arange(views)[:, None], chosen])
+    return dataclasses.replace(
+        templates,
+        patches=jax.tree.map(take, templates.patches),
+        norm=take(templates.norm),
+        seen=take(templates.seen),
+    )
+
+
+def pad_templates(objects: Sequence[Templates]) -> Templates:
+    """Several objects' templates padded to one size and stacked, so that ``jax.vmap(estimate, …)`` takes them at once.
+
+    What is added is absent. Patches are not valid. Views repeat the last one's pose and camera without a valid patch:
+    they rank behind all others and lend no features. Surface and appearance points repeat the first one without a
+    normal: they face no camera, so nothing is fitted to them and they are not drawn, and no outline is wider for them.
+    An object gives the same answer as alone, up to rounding, if it has no fewer views than ``config.match.views`` and
+    no fewer surface points than ``config.refine.points``; with fewer, it is tried and refined as often as the others.
+
+    Args:
+        objects: each as ``load`` or ``onboard`` return it, or after ``compact``; not batched.
+
+    Returns:
+        Templates with a leading axis of the objects.
+
+    Raises:
+        ValueError: there is none, or they are not alike: of different encoders, features of different lengths, or some
+            with a basis or an appearance and some without.
+    """
+    objects = list(objects)
+    if not objects:
+        raise ValueError("pad_templates takes at least one object's templates")
+    shapes = {(np.ndim(o.patches.features), *(np.shape(x)[-1] for x in (o.patches.features, o.mean))) for o in objects}
+    if len(shapes) > 1 or next(iter(shapes))[0] != 3:
+        raise ValueError(
+            "pad_templates takes single objects whose features have one shape [views, patches, channels], not "
+            + " and ".join(str(np.shape(o.patches.features)) for o in objects)
+        )
+    encoders = sorted({o.patches.encoder for o in objects if o.patches.encoder is not None})
+    if len(encoders) > 1:
+        raise ValueError(f"these objects were onboarded with different encoders: {', '.join(map(repr, encoders))}")
+    objects = [dataclasses.replace(o, patches=dataclasses.replace(o.patches, encoder=None)) for o in objects]
+    for name in ("basis", "appearance"):
+        if len({getattr(o, name) is None for o in objects}) > 1:
+            raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
+    views, patches = (max(o.norm.shape[axis] for o in objects) for axis in (0, 1))
+    count = max(o.surface.points.shape[0] for o in objects)
+    drawn = max(0 if o.appearance is None else o.appearance.points.shape[0] for o in objects)
+    padded = [_pad(o, views, patches, count, drawn) for o in objects]
+    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
+    patches = dataclasses.replace(stacked.patches, encoder=encoders[0] if encoders else None)
+    return dataclasses.replace(stacked, patches=patches)
+
+
+def _pad(templates: Templates, views: int, patches: int, count: int, drawn: int) -> Templates:
+    """One object's templates with so many views, patches in each, and points of surface and appearance."""
+
+    def extended(array: Any, *sizes: int, repeat: int | None = None):
+        """With rows of zeros, or of one that is repeated, at the end of the first axes."""
+        array = np.asarray(array)
+        for axis, size in enumerate(sizes):
+            more = size - array.shape[axis]
+            row = np.take(array, [0 if repeat is None else repeat], axis)
+            row = np.zeros_like(row) if repeat is None else row
+            array = np.concatenate([array, np.repeat(row, more, axis)], axis)
+        return jnp.asarray(array)
+
+    def points(record: Any, size: int):
+        fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+        more = {name: extended(value, size) for name, value in fields.items() if name != "points"}
+        return type(record)(points=extended(record.points, size, repeat=0), **more)
+
+    last = lambda tree: jax.tree.map(lambda x: extended(x, views, repeat=-1), tree)
+    return dataclasses.replace(
+        templates,
+        patches=jax.tree.map(lambda x: extended(x, views, patches), templates.patches),
+        norm=extended(templates.norm, views, patches),
+        seen=extended(templates.seen, views, patches),
+        camera_from_object=last(templates.camera_from_object),
+        camera=last(templates.camera),
+        surface=points(templates.surface, count),
+        appearance=None if templates.appearance is None else points(templates.appearance, drawn),
+    )
