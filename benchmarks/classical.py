@@ -20,7 +20,8 @@ from ipjax import cameras
 from ipjax.bop import run as studies
 from ipjax.bop.dataset import MM, Dataset, Estimate, Frame, Target
 from ipjax.bop.evaluation import Alignment, evaluate, read_alignment
-from ipjax.files.meshes.mesh import Mesh, load_mesh
+from ipjax.files.meshes.loading import load_mesh
+from ipjax.files.meshes.mesh import Mesh
 from ipjax.files.weights.hashes import hash_file
 from ipjax.synthetic.degradation import degrade
 

@@ -280,7 +280,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
         photo = onboard_photo(source, encoder, config, **given, **lrm, **options)
         templates, info = photo.templates, photo.info
         if arguments.save_mesh is not None:
-            from ipjax.files.meshes.mesh import save_mesh
+            from ipjax.files.meshes.saving import save_mesh
 
             save_mesh(photo.reconstruction.mesh, arguments.save_mesh)
     else:
@@ -292,7 +292,9 @@ def _onboard(arguments: argparse.Namespace) -> int:
         templates, info = onboard(source, encoder, config, metres_per_unit=unit, **options)
     warned: tuple[str, ...] = ()
     if arguments.report is not None:
-        from ipjax.files.meshes.mesh import clean, load_mesh, normalise
+        from ipjax.files.meshes.cleaning import clean
+        from ipjax.files.meshes.loading import load_mesh
+        from ipjax.files.meshes.mesh import normalise
         from ipjax.onboarding.report import examine, write_report
 
         mesh = normalise(clean(load_mesh(source) if photo is None else photo.reconstruction.mesh)[0])
@@ -1066,7 +1068,8 @@ def _degrade(arguments: argparse.Namespace) -> int:
     output = _check_output(arguments.output, (".glb",))
     if arguments.alignment is not None:
         _check_output(arguments.alignment, (".json",))
-    from ipjax.files.meshes.mesh import load_mesh, save_mesh
+    from ipjax.files.meshes.loading import load_mesh
+    from ipjax.files.meshes.saving import save_mesh
     from ipjax.files.storage.writing import write_text
     from ipjax.inference.reports import to_json
     from ipjax.synthetic.degradation import alignment_as_json, degrade

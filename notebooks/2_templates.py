@@ -21,7 +21,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ipjax.estimation.features import lift
-from ipjax.files.meshes.mesh import sample_surface
+from ipjax.files.meshes.sampling import sample_surface
 from ipjax.onboarding.mesh import framing_cameras
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.rendering.render import render

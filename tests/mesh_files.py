@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from ipjax.files.meshes.mesh import Mesh, sample_texture
+from ipjax.files.meshes.mesh import Mesh
+from ipjax.files.meshes.textures import sample_texture
 
 SIDES = np.array([[220, 40, 40], [40, 200, 60], [40, 70, 220], [230, 210, 40], [200, 60, 210], [60, 200, 210]])
 HALF = np.array([1.0, 1.5, 2.0])

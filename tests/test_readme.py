@@ -11,7 +11,7 @@ import pytest
 import test_pipeline
 
 import ipjax
-from ipjax.files.meshes.mesh import save_mesh
+from ipjax.files.meshes.saving import save_mesh
 from ipjax.files.weights.catalogue import WeightsError
 from ipjax.files.weights.finding import resolve
 from ipjax.onboarding import mesh as onboarding

@@ -19,7 +19,8 @@ from jaxtyping import Bool, Float, UInt8
 from ipjax.files.images.depth import read_depth
 from ipjax.files.images.masks import as_mask, read_mask
 from ipjax.files.images.opening import BYTES_PER_PIXEL, read_rgb, read_size
-from ipjax.files.meshes.mesh import Mesh, load_mesh, move
+from ipjax.files.meshes.loading import load_mesh
+from ipjax.files.meshes.mesh import Mesh, move
 from ipjax.files.storage.budget import check_budget
 from ipjax.files.storage.parsing import read_json
 from ipjax.files.storage.writing import write_text

@@ -18,7 +18,7 @@ from ipjax import __version__
 from ipjax.bop.dataset import MM, Dataset, DatasetError, Estimate, Frame, Target
 from ipjax.bop.evaluation import Alignment, read_alignment
 from ipjax.config import Config, OnboardConfig
-from ipjax.files.meshes.mesh import load_mesh
+from ipjax.files.meshes.loading import load_mesh
 from ipjax.files.objects.layout import FORMAT
 from ipjax.files.objects.loading import load
 from ipjax.files.objects.saving import save

@@ -13,7 +13,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from ipjax.config import Config
-from ipjax.files.meshes.mesh import Mesh, sample_surface, save_mesh
+from ipjax.files.meshes.mesh import Mesh
+from ipjax.files.meshes.sampling import sample_surface
+from ipjax.files.meshes.saving import save_mesh
 from ipjax.files.objects.layout import SUFFIX
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.drawing import draw, gather_evidence, write_image

@@ -13,7 +13,11 @@ from jaxtyping import Array, Float, UInt8
 
 from ipjax.config import DescribeConfig, OnboardConfig
 from ipjax.estimation.features import centre, check_cut, cut, describe, principal_basis
-from ipjax.files.meshes.mesh import Mesh, clean, load_mesh, normalise, sample_appearance, sample_surface, sample_texture
+from ipjax.files.meshes.cleaning import clean
+from ipjax.files.meshes.loading import load_mesh
+from ipjax.files.meshes.mesh import Mesh, normalise
+from ipjax.files.meshes.sampling import sample_appearance, sample_surface
+from ipjax.files.meshes.textures import sample_texture
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.encoder import load_encoder

@@ -251,7 +251,7 @@ def draw_sides(
 
 def tint_guessed(mesh: Mesh) -> Mesh:
     """The mesh with its guessed part in orange, its seen part in grey-blue, and a trace of its own colours."""
-    from ipjax.files.meshes.mesh import sample_texture
+    from ipjax.files.meshes.textures import sample_texture
 
     colours = mesh.colours if mesh.texture is None or mesh.uv is None else sample_texture(mesh.texture, mesh.uv)
     grey = colours.mean(1, keepdims=True)

@@ -23,7 +23,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from ipjax.cameras import borders, resize
-from ipjax.files.meshes.mesh import Mesh, sample_texture
+from ipjax.files.meshes.mesh import Mesh
+from ipjax.files.meshes.textures import sample_texture
 from ipjax.progress import bar
 from ipjax.records import Camera, Similarity, View
 

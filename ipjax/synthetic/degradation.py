@@ -17,7 +17,8 @@ import dataclasses
 import numpy as np
 from scipy import ndimage, sparse
 
-from ipjax.files.meshes.mesh import Mesh, make_mesh, normalise, sample_texture, vertex_normals
+from ipjax.files.meshes.mesh import Mesh, make_mesh, normalise, vertex_normals
+from ipjax.files.meshes.textures import sample_texture
 from ipjax.transforms import Similarity
 
 STEPS = {1: 3, 2: 10}  # of smoothing

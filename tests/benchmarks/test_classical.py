@@ -11,7 +11,7 @@ from bop_roots import ERRORS, write_models
 
 from benchmarks import classical
 from ipjax.bop.dataset import MM, Frame
-from ipjax.files.meshes.mesh import load_mesh
+from ipjax.files.meshes.loading import load_mesh
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -17,7 +17,7 @@ LIMIT = 1_000_000_000  # bytes of memory, the interpreter and its packages with 
 CHILD = """
 import json, resource, sys, warnings
 from pathlib import Path
-from ipjax.files.meshes.mesh import load_mesh
+from ipjax.files.meshes.loading import load_mesh
 
 answers = {}
 for name in sys.argv[1:]:
@@ -257,7 +257,7 @@ def test_finds_what_is_wrong_with_an_answer():
 
 
 def test_there_is_one_budget_and_it_can_be_set(tmp_path, monkeypatch):
-    from ipjax.files.meshes.mesh import load_mesh
+    from ipjax.files.meshes.loading import load_mesh
 
     path = tmp_path / "box.glb"
     path.write_bytes(plain().glb())
@@ -282,6 +282,6 @@ def test_a_glb_of_another_order_is_refused(tmp_path):
 
 
 def load_hostile(path):
-    from ipjax.files.meshes.mesh import load_mesh
+    from ipjax.files.meshes.loading import load_mesh
 
     return load_mesh(path)

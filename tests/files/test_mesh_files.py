@@ -28,7 +28,9 @@ from mesh_files import (
 )
 from PIL import Image
 
-from ipjax.files.meshes.mesh import diameter, load_mesh, make_mesh, save_mesh
+from ipjax.files.meshes.loading import load_mesh
+from ipjax.files.meshes.mesh import diameter, make_mesh
+from ipjax.files.meshes.saving import save_mesh
 from ipjax.files.meshes.textures import from_linear, sample_texture, to_linear
 
 LIGHT = to_linear(COLOURS / 255)  # glTF keeps colours of vertices as linear light

@@ -11,18 +11,13 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ipjax.files.meshes import farthest
+from ipjax.files.meshes.cleaning import clean
 from ipjax.files.meshes.farthest import largest_distance
-from ipjax.files.meshes.mesh import (
-    clean,
-    diameter,
-    load_mesh,
-    make_mesh,
-    normalise,
-    sample_appearance,
-    sample_surface,
-    sample_texture,
-    save_mesh,
-)
+from ipjax.files.meshes.loading import load_mesh
+from ipjax.files.meshes.mesh import diameter, make_mesh, normalise
+from ipjax.files.meshes.sampling import sample_appearance, sample_surface
+from ipjax.files.meshes.saving import save_mesh
+from ipjax.files.meshes.textures import sample_texture
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding import mesh as onboarding
 

@@ -15,7 +15,8 @@ from test_layers import MODULES
 
 from ipjax.bop import run as studies
 from ipjax.config import OnboardConfig
-from ipjax.files.meshes.mesh import make_mesh, save_mesh
+from ipjax.files.meshes.mesh import make_mesh
+from ipjax.files.meshes.saving import save_mesh
 from ipjax.files.objects.loading import load
 from ipjax.files.objects.saving import save
 from ipjax.files.provenance import PACKAGES, find_packages, hash_executed, list_executed

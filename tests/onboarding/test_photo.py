@@ -206,7 +206,8 @@ def test_turns_that_look_alike_are_found():
 
 
 def test_the_report_needs_nothing_beside_it_and_says_what_matters(metric, encoder, tmp_path):
-    from ipjax.files.meshes.mesh import clean, normalise
+    from ipjax.files.meshes.cleaning import clean
+    from ipjax.files.meshes.mesh import normalise
 
     mesh = normalise(clean(metric.reconstruction.mesh)[0])
     axes = np.asarray(metric.templates.axes, np.float64)

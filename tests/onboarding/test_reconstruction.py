@@ -11,7 +11,7 @@ from conftest import GOLDEN
 from flax import nnx
 from golden.make_triposr import unpack
 
-from ipjax.files.meshes.mesh import sample_texture
+from ipjax.files.meshes.textures import sample_texture
 from ipjax.files.weights.catalogue import WeightsError
 from ipjax.networks import triposr
 from ipjax.onboarding import inflation, reconstruction

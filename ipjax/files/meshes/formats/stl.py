@@ -5,7 +5,8 @@ import struct
 
 import numpy as np
 
-from ipjax.files.meshes.parts import MARK, Part, Source
+from ipjax.files.meshes.formats.part import Part
+from ipjax.files.meshes.formats.source import BYTE_ORDER_MARK, Source
 
 # Digits are bounded: without, a file of nothing but digits takes the square of its length to be refused.
 NUMBER = rb"[+-]?(?:[0-9]{1,64}(?:\.[0-9]{0,64})?|\.[0-9]{1,64})(?:e[+-]?[0-9]{1,8})?|[+-]?nan|[+-]?inf"
@@ -16,7 +17,7 @@ RECORD = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attrib
 def read_stl(source: Source) -> list[Part]:
     """One part without colour, three vertices a face. Raises ValueError in a sentence."""
     data = source.read()
-    text = data.removeprefix(MARK)
+    text = data.removeprefix(BYTE_ORDER_MARK)
     count = struct.unpack("<I", data[80:84])[0] if len(data) >= 84 else -1
     # Binary files may begin with "solid" too, and some have bytes behind their faces: a zero is in no text.
     binary = len(data) == 84 + 50 * count or (count >= 0 and b"\0" in data[:512])

@@ -1,0 +1,1 @@
+"""Mesh formats: each is read into parts with one look each."""
