@@ -1,4 +1,4 @@
-"""Renders one job with MuJoCo, in a process of its own; started by `ipjax.rendering.render`, never imported.
+"""Renders one job with MuJoCo, in a process of its own; started by `mujoco_process`, never imported.
 
 MuJoCo reads MUJOCO_GL when it is imported and a wrong value can abort the process, so the parent chooses it and only
 this child runs GL. It needs NumPy and MuJoCo alone, to start fast. Arguments: the folder of the job. In: ``job.json``
@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 
-def stand_in(count: int) -> np.ndarray:
+def sphere_points(count: int) -> np.ndarray:
     """Points spread over the unit sphere."""
     height = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1 + 5**0.5) * np.arange(count)
@@ -33,8 +33,8 @@ def build_model(folder: Path, job: dict) -> mujoco.MjModel:
     arrays = [dict(np.load(folder / f"mesh{i}.npz")) for i in range(job["meshes"])]
     for i, mesh in enumerate(arrays):
         item = spec.add_mesh(name=f"mesh{i}")
-        # The compiler measures a volume, which a flat or tiny mesh lacks: show it a ball of as many points instead.
-        item.uservert = stand_in(len(mesh["vertices"])).ravel().tolist()
+        # The compiler measures a volume, which a flat or tiny mesh lacks: give it a ball of as many points instead.
+        item.uservert = sphere_points(len(mesh["vertices"])).ravel().tolist()
         item.userface = mesh["faces"].ravel().tolist()
         item.usernormal = mesh["normals"].ravel().tolist()
         item.userfacenormal = mesh["faces"].ravel().tolist()
@@ -129,6 +129,7 @@ def shrink(rgb: np.ndarray, covered: np.ndarray, factor: int) -> np.ndarray:
 
 
 def main(folder: Path) -> None:
+    """Draw all frames of the job in the folder, and tell the parent on standard output how far it is."""
     job = json.loads((folder / "job.json").read_text())
     poses = np.load(folder / "poses.npy")  # frame, mesh, 3, 4
     frusta = np.load(folder / "frusta.npy")  # frame, 6

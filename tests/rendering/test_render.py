@@ -1,9 +1,5 @@
 """Rendering against ray casting, by every backend that works here; the rasteriser always does."""
 
-import logging
-import subprocess
-import sys
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,8 +8,7 @@ import trimesh
 from ipjax.files.meshes.mesh import make_mesh, normalise
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Camera, Similarity
-from ipjax.rendering import render as rendering
-from ipjax.rendering.render import RenderError, available_backends, render, render_scene
+from ipjax.rendering.render import available_backends, render, render_each, render_scene
 
 
 @pytest.fixture(scope="module")
@@ -179,111 +174,6 @@ def test_one_triangle_and_nothing_in_view(backend):
     np.testing.assert_array_equal(view.mask, image.mask[0])
 
 
-def test_a_process_that_fixed_another_backend_can_render(report):
-    if report.get("egl") != "ok":
-        pytest.skip(f"no EGL: {report}")
-    code = """
-import os
-os.environ["MUJOCO_GL"] = "disable"
-import mujoco, numpy as np, jax.numpy as jnp
-from ipjax.files.meshes.mesh import make_mesh
-from ipjax.rendering.render import render
-from ipjax.records import Camera, Similarity
-mesh = make_mesh(np.eye(3), np.array([[0, 1, 2]]))
-pose = Similarity(jnp.eye(3), jnp.array([0.0, 0, 3]), jnp.float32(1))
-image = render(mesh, pose, Camera(jnp.full(2, 10.0), jnp.full(2, 7.5)), 16, 16)
-assert image.backend == "egl" and image.mask.any()
-"""
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
-
-
-def test_failure_is_a_sentence_and_the_rasteriser_takes_over(monkeypatch, caplog):
-    triangle, one = make_mesh(np.eye(3), np.array([[0, 1, 2]])), pose(np.eye(3), [0, 0, 3.0])
-    monkeypatch.setattr(rendering, "_candidates", lambda: ["nonsense"])
-    monkeypatch.setitem(rendering._HELP, "nonsense", "install libnonsense1")
-    monkeypatch.setattr(rendering, "_failed", {})
-    monkeypatch.setattr(rendering, "BACKENDS", (*rendering.BACKENDS, "nonsense"))
-    with pytest.raises(RenderError, match=r"nonsense.*install libnonsense1") as caught:
-        render(triangle, one, camera(10, 10, 7.5, 7.5), 16, 16, backend="nonsense")
-    assert "\n" not in str(caught.value)
-    with caplog.at_level(logging.WARNING, "ipjax"):
-        image = render(triangle, one, camera(10, 10, 7.5, 7.5), 16, 16)
-    assert image.backend == "raster" and image.mask.any() and "libnonsense1" in caplog.text
-
-
-CHILD = """
-import json, sys, time
-from pathlib import Path
-import numpy as np
-folder, count = Path(sys.argv[1]), Path(COUNT)
-runs = len(count.read_text()) if count.exists() else 0
-count.write_text("x" * (runs + 1))
-def draw(frames=1):
-    print("ready", flush=True)
-    np.save(folder / "rgb.npy", np.zeros((1, 16, 16, 3), np.uint8))
-    np.save(folder / "depth.npy", np.ones((1, 16, 16), np.float32))
-    print("frame 1", flush=True)
-    print("done", flush=True)
-def work(seconds):
-    begin = time.process_time()
-    while time.process_time() - begin < seconds:
-        pass
-"""
-
-
-@pytest.fixture
-def child(tmp_path, monkeypatch):
-    """Renders by a child of the test's own, one backend, a short patience; the number of children started so far."""
-    count = tmp_path / "count"
-    monkeypatch.setattr(rendering, "_candidates", lambda: ["egl"])
-    monkeypatch.setattr(rendering, "_failed", {})
-    monkeypatch.setattr(rendering, "_TIMEOUT", 0.5)
-    monkeypatch.setattr(rendering, "_CHILD", tmp_path / "child.py")
-    triangle, one = make_mesh(np.eye(3), np.array([[0, 1, 2]])), pose(np.eye(3), [0, 0, 3.0])
-
-    def draw(does: str) -> tuple[str, int]:
-        (tmp_path / "child.py").write_text(CHILD.replace("COUNT", repr(str(count))) + does)
-        count.write_text("")
-        backend = render(triangle, one, camera(10, 10, 7.5, 7.5), 16, 16).backend
-        return backend, len(count.read_text())
-
-    return draw
-
-
-def test_who_is_silent_but_works_is_waited_for(child):
-    assert child("work(1.5)\ndraw()") == ("egl", 1)
-
-
-@pytest.mark.parametrize(
-    ("fault", "runs"),
-    [
-        ("time.sleep(60)", 1),  # it never had a context
-        ("print('ready', flush=True)\ntime.sleep(60)", 2),
-        ("print('ready', flush=True)\nsys.exit(9)", 2),
-        ("print('ready', flush=True)\nprint('error MemoryError: too many', flush=True)", 2),
-    ],
-)
-def test_a_fault_that_passes_is_forgotten(child, fault, runs):
-    """Whatever goes wrong, this job is drawn by the rasteriser and the next one by MuJoCo again."""
-    assert child(fault) == ("raster", runs)
-    assert child("draw()") == ("egl", 1)
-    assert rendering._failed == {}
-
-
-@pytest.mark.parametrize("fault", ["sys.exit(1)", "print('ready', flush=True)\nsys.exit(1)"])
-def test_what_fails_once_is_done_again_at_once(child, fault):
-    assert child(f"if runs == 0:\n    {fault.replace(chr(10), chr(10) + '    ')}\ndraw()") == ("egl", 2)
-
-
-def test_who_cannot_be_had_is_left_alone_for_a_while(child, monkeypatch):
-    missing = "print('error ImportError: no EGL', flush=True)"
-    assert child(missing) == ("raster", 2)
-    assert child("draw()") == ("raster", 0)
-    monkeypatch.setattr(rendering, "_REST", 0.0)
-    assert child(missing) == ("raster", 1)
-    assert child("draw()") == ("egl", 1)
-
-
 def test_bad_arguments_are_told():
     triangle, one, lens = make_mesh(np.eye(3), np.array([[0, 1, 2]])), pose(np.eye(3), [0, 0, 3.0]), camera(9, 9, 7, 7)
     for call in (
@@ -319,7 +209,7 @@ def test_each_image_shows_its_own_mesh_with_its_own_texture():
     )
     camera = Camera(focal=jnp.full(2, 20.0, jnp.float32), centre=jnp.full(2, 7.5, jnp.float32))
     for backend in ("auto", "raster"):
-        drawn = rendering.render_each(meshes, which, pose, camera, 16, 16, backend=backend)
+        drawn = render_each(meshes, which, pose, camera, 16, 16, backend=backend)
         middle = drawn.rgb[:, 7, 7].astype(int)
         np.testing.assert_allclose(middle, [colours[i] for i in which], atol=1)
         np.testing.assert_allclose(drawn.depth[:, 7, 7], 4.0, atol=1e-5)
