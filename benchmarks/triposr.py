@@ -26,8 +26,10 @@ def main() -> None:
     import numpy as np
     from flax import nnx
 
-    from ipjax.networks import triposr
-    from ipjax.onboarding import reconstruction
+    from ipjax.networks.triposr.config import TripoSRConfig
+    from ipjax.networks.triposr.field import density_grid, query
+    from ipjax.networks.triposr.model import TripoSR, prepare_image
+    from ipjax.onboarding.reconstruction.triposr import find_surface
 
     seconds: dict[str, float] = {}
     start = last = time.perf_counter()
@@ -43,19 +45,19 @@ def main() -> None:
         last = now
         print(f"{stage}: {seconds[stage]:.1f} s, peak {peak():.2f} GB", flush=True)
 
-    config = triposr.TripoSRConfig(dtype=arguments.dtype)
-    model = triposr.TripoSR(config, rngs=nnx.Rngs(0))
+    config = TripoSRConfig(dtype=arguments.dtype)
+    model = TripoSR(config, rngs=nnx.Rngs(0))
     jax.block_until_ready(nnx.state(model))
     done("weights (random)")
     photo = jnp.asarray(np.random.default_rng(0).random((600, 600, 3), dtype=np.float32))
-    image = triposr.prepare_image(photo, config.image_size)
+    image = prepare_image(photo, config.image_size)
     tokens = nnx.jit(lambda tokenizer, image: tokenizer(image))(model.tokenizer, image).block_until_ready()
     done("image tokenizer")
     backbone = nnx.jit(lambda model, tokens: model.unfold(model.backbone(model.tokens(), tokens)))
     triplane = backbone(model, tokens).block_until_ready()
     done("backbone and up-sampling")
     slabs = min(16, arguments.resolution)
-    run = nnx.jit(lambda m, t, at: triposr.density_grid(m, t, arguments.resolution, start=at, count=slabs))
+    run = nnx.jit(lambda m, t, at: density_grid(m, t, arguments.resolution, start=at, count=slabs))
     parts = []
     for at in range(0, arguments.resolution, slabs):
         parts.append(np.asarray(run(model, triplane, jnp.int32(min(at, arguments.resolution - slabs)))))
@@ -63,10 +65,10 @@ def main() -> None:
     grid = np.concatenate(parts)[: arguments.resolution]
     done("density grid")
     # Random weights have no surface at the published threshold: take the value that a hundredth of the grid exceeds.
-    vertices, _ = reconstruction.find_surface(grid, float(np.quantile(grid, 0.99)), config.radius)
+    vertices, _ = find_surface(grid, float(np.quantile(grid, 0.99)), config.radius)
     done("surface")
     points = jnp.asarray(vertices[: 1 << 16], jnp.float32)
-    jax.block_until_ready(nnx.jit(lambda m, t, p: triposr.query(m, t, p, chunk=1 << 14))(model, triplane, points))
+    jax.block_until_ready(nnx.jit(lambda m, t, p: query(m, t, p, chunk=1 << 14))(model, triplane, points))
     done("colour of 65 536 points")
     print(
         json.dumps(

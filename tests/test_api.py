@@ -59,7 +59,10 @@ def positional(function) -> list[str]:
 
 
 def is_architecture(annotation) -> bool:
-    return inspect.isclass(annotation) and annotation.__module__ in ("ipjax.networks.dinov2", "ipjax.networks.triposr")
+    return inspect.isclass(annotation) and annotation.__module__ in (
+        "ipjax.networks.dinov2",
+        "ipjax.networks.triposr.config",
+    )
 
 
 def find_disorder(name: str, function) -> list[str]:

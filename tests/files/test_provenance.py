@@ -100,7 +100,7 @@ def test_results_hang_on_the_estimate(copies):
         "ipjax.estimation.refinement",
         "ipjax_kernels.consensus",
     } <= executed
-    assert not {"ipjax.cli", "ipjax.networks.triposr", "ipjax.bop.evaluation"} & executed
+    assert not {"ipjax.cli", "ipjax.networks.triposr.model", "ipjax.bop.evaluation"} & executed
 
 
 def test_the_key_of_an_object_file(tmp_path):

@@ -12,8 +12,13 @@ from conftest import GOLDEN
 from flax import nnx
 from golden.make_triposr import cut
 
-from ipjax.networks import triposr
-from ipjax.networks.triposr import Rays, TripoSR, TripoSRConfig, VisionConfig
+from ipjax.networks.dinov2 import normalise
+from ipjax.networks.triposr.config import TripoSRConfig, VisionConfig
+from ipjax.networks.triposr.field import density_grid, query, sample_planes
+from ipjax.networks.triposr.model import TripoSR, prepare_image
+from ipjax.networks.triposr.renderer import Rays, meet_cube, orbit_rays, render
+from ipjax.networks.triposr.vision import interpolate_positions
+from ipjax.networks.triposr.weights import load_model, official_shapes
 
 TINY = TripoSRConfig(
     vision=VisionConfig(width=24, layers=2, heads=3, hidden=96, patch=16, grid=5),
@@ -38,7 +43,7 @@ def _golden() -> dict[str, np.ndarray]:
 
 @functools.cache
 def _model() -> TripoSR:
-    return triposr.load_model(TINY, _weights(_golden()))
+    return load_model(TINY, _weights(_golden()))
 
 
 @functools.cache
@@ -46,7 +51,7 @@ def _photos() -> np.ndarray:
     """What the model reads: both pictures, prepared by us (`test_image_preparation_is_the_official_one`)."""
     golden = _golden()
     pictures = (golden[name].astype(np.float32) / 255 for name in ("pre/composite_u8", "in/image1_u8"))
-    return np.stack([triposr.prepare_image(jnp.asarray(picture), 128) for picture in pictures])
+    return np.stack([prepare_image(jnp.asarray(picture), 128) for picture in pictures])
 
 
 def _weights(golden):
@@ -138,14 +143,14 @@ def test_image_preparation_is_the_official_one():
     _close(cut("in/rgb_cond", _photos()), golden["in/rgb_cond"], 2e-5)
     _close(cut("pre/model_input_128", _photos()[:1]), golden["pre/model_input_128"], 2e-5)
     noise = np.repeat(golden["pre/resize_aa_in_u8"].astype(np.float32) / 255, 3, axis=2)
-    _close(triposr.prepare_image(jnp.asarray(noise), 64)[..., :1], golden["pre/resize_aa_out_64"][0], 2e-5)
-    normed = triposr.normalise(jnp.asarray(_photos())).transpose(0, 3, 1, 2)
+    _close(prepare_image(jnp.asarray(noise), 64)[..., :1], golden["pre/resize_aa_out_64"][0], 2e-5)
+    normed = normalise(jnp.asarray(_photos())).transpose(0, 3, 1, 2)
     _close(cut("vit/pixel_values_normalized", normed), golden["vit/pixel_values_normalized"], 2e-5)
 
 
 def test_patches_are_the_official_ones():
     golden, model = _golden(), _model()
-    positions = triposr.interpolate_positions(model.tokenizer.positions[...], 8)
+    positions = interpolate_positions(model.tokenizer.positions[...], 8)
     patches = _stages()["vit/embeddings"] - np.asarray(positions)
     _close(cut("vit/patch_embeddings", patches[:, 1:]), golden["vit/patch_embeddings"])
 
@@ -157,7 +162,7 @@ def test_positions_follow_the_rule_of_the_checkpoint_and_not_the_newer_one():
         (stored, 8, "vit/pos_embed_interpolated", "vit/pos_embed_interpolated_NEW_ge_4_45_for_contrast"),
         (golden["posembed14to32/in"][0], 32, "posembed14to32/out", "posembed14to32/out_NEW_ge_4_45_for_contrast"),
     ):
-        ours = triposr.interpolate_positions(jnp.asarray(source), side)[None]
+        ours = interpolate_positions(jnp.asarray(source), side)[None]
         _close(ours, golden[old], 2e-5)
         assert np.abs(np.asarray(ours) - golden[new]).max() > 0.01
 
@@ -169,8 +174,8 @@ def test_queries_are_the_official_ones():
     @nnx.jit
     @functools.partial(nnx.vmap, in_axes=(None, 0))
     def run(model, codes):
-        features = triposr.sample_planes(codes, points, model.config.radius)
-        return features, model.decoder(features), *triposr.query(model, codes, points, chunk=300)
+        features = sample_planes(codes, points, model.config.radius)
+        return features, model.decoder(features), *query(model, codes, points, chunk=300)
 
     features, raw, density, colour = run(model, jnp.asarray(golden["scene_codes"]))
     _close(features, golden["query/triplane_features"])
@@ -188,7 +193,7 @@ def test_queries_are_the_official_ones():
 @functools.cache
 def _grid():
     codes = jnp.asarray(_golden()["scene_codes"])
-    run = nnx.jit(nnx.vmap(lambda model, codes: triposr.density_grid(model, codes, 32), in_axes=(None, 0)))
+    run = nnx.jit(nnx.vmap(lambda model, codes: density_grid(model, codes, 32), in_axes=(None, 0)))
     return run(_model(), codes)
 
 
@@ -205,12 +210,12 @@ def test_grid_is_the_field_at_its_points_slab_by_slab():
     model, codes = _model(), jnp.asarray(_golden()["scene_codes"][0])
     axis = np.linspace(-TINY.radius, TINY.radius, 32, dtype=np.float32)
     points = np.stack(np.meshgrid(axis[5:9], axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    density, _ = nnx.jit(triposr.query)(model, codes, jnp.asarray(points))
-    slabs = nnx.jit(lambda model, codes: triposr.density_grid(model, codes, 32, start=5, count=4))(model, codes)
+    density, _ = nnx.jit(query)(model, codes, jnp.asarray(points))
+    slabs = nnx.jit(lambda model, codes: density_grid(model, codes, 32, start=5, count=4))(model, codes)
     np.testing.assert_allclose(slabs.reshape(-1), density, rtol=2e-4)
     np.testing.assert_allclose(slabs, _grid()[0][5:9], rtol=1e-5)
     with pytest.raises(ValueError, match="do not lie in a grid of 32"):
-        triposr.density_grid(model, codes, 32, start=30, count=4)
+        density_grid(model, codes, 32, start=30, count=4)
 
 
 ORBITS = {
@@ -222,7 +227,7 @@ ORBITS = {
 
 def _rays(name: str) -> Rays:
     views, options = ORBITS[name]
-    return triposr.orbit_rays(views, 16, 16, **options)
+    return orbit_rays(views, 16, 16, **options)
 
 
 @functools.cache
@@ -230,9 +235,7 @@ def _renders() -> dict:
     """All views of both triplanes in one call; images x views x 16 x 16 for each orbit."""
     codes = jnp.asarray(_golden()["scene_codes"])
     rays = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(_rays, ORBITS))
-    run = nnx.jit(
-        nnx.vmap(lambda model, codes, rays: triposr.render(model, codes, rays, chunk=500), in_axes=(None, 0, None))
-    )
+    run = nnx.jit(nnx.vmap(lambda model, codes, rays: render(model, codes, rays, chunk=500), in_axes=(None, 0, None)))
     seen = run(_model(), codes, rays)
     cuts = np.cumsum([0, *(views for views, _ in ORBITS.values())])
     return {
@@ -247,7 +250,7 @@ def test_rays_and_renders_are_the_official_ones(name):
     rays = _rays(name)
     _close(rays.origins, golden[f"{name}/rays_o"], 2e-6)
     _close(rays.directions, golden[f"{name}/rays_d"], 2e-6)
-    near, far, valid = map(np.asarray, triposr.meet_cube(rays, TINY.radius))
+    near, far, valid = map(np.asarray, meet_cube(rays, TINY.radius))
     np.testing.assert_array_equal(valid, golden[f"{name}/valid"])
     _close(near, golden[f"{name}/t_near"], 2e-5)
     _close(far, golden[f"{name}/t_far"], 2e-5)
@@ -270,14 +273,14 @@ def test_distance_is_where_the_light_stops():
     model, codes = _model(), jnp.asarray(_golden()["scene_codes"][0])
     rays, seen = _rays("render_default"), _renders()["render_default"]
     pick = [(0, 7, 7), (1, 8, 6), (2, 5, 9), (3, 10, 8)]
-    near, far, _ = map(np.asarray, triposr.meet_cube(rays, TINY.radius))
+    near, far, _ = map(np.asarray, meet_cube(rays, TINY.radius))
     middle = (np.arange(128) + 0.5) / 128
     at = np.stack([near[spot] * (1 - middle) + far[spot] * middle for spot in pick])
     origins, directions = (
         np.stack([np.asarray(leaf)[spot] for spot in pick]) for leaf in (rays.origins, rays.directions)
     )
     points = (origins[:, None] + at[..., None] * directions[:, None]).reshape(-1, 3).astype(np.float32)
-    density, _ = nnx.jit(triposr.query)(model, codes, jnp.asarray(points))
+    density, _ = nnx.jit(query)(model, codes, jnp.asarray(points))
     for spot, distance, sigma in zip(pick, at, np.asarray(density, np.float64).reshape(4, 128), strict=True):
         light, opacity, mean = 1.0, 0.0, 0.0
         for z, s in zip(distance, sigma, strict=True):
@@ -293,7 +296,7 @@ def test_distance_is_where_the_light_stops():
 def test_names_and_shapes_of_the_published_checkpoint():
     """A bijection with the published list, at the published size, without allocating it."""
     published = json.loads((GOLDEN / "triposr_published.json").read_text())
-    ours = triposr.official_shapes(TripoSRConfig())
+    ours = official_shapes(TripoSRConfig())
     assert ours == {name: tuple(shape) for name, shape in published["state_dict"].items()}
     assert len(ours) == 549
     assert sum(int(np.prod(shape)) for shape in ours.values()) == published["num_params"]
@@ -330,11 +333,11 @@ def test_wrong_weights_are_named():
     weights = _weights(_golden())
     short = {name: array for name, array in weights.items() if name != "backbone.proj_in.bias"}
     with pytest.raises(ValueError, match=r"1 missing \(backbone\.proj_in\.bias\)"):
-        triposr.load_model(TINY, short)
+        load_model(TINY, short)
     with pytest.raises(ValueError, match=r"1 not known \(more\)"):
-        triposr.load_model(TINY, weights | {"more": np.zeros(3)})
+        load_model(TINY, weights | {"more": np.zeros(3)})
     with pytest.raises(ValueError, match=r"1 of another shape \(tokenizer\.embeddings\)"):
-        triposr.load_model(TINY, weights | {"tokenizer.embeddings": np.zeros((3, 32, 8, 9))})
+        load_model(TINY, weights | {"tokenizer.embeddings": np.zeros((3, 32, 8, 9))})
 
 
 def test_every_weight_arrives_where_it_belongs():
@@ -344,7 +347,7 @@ def test_every_weight_arrives_where_it_belongs():
         name: np.full(array.shape, i, np.float32) for i, (name, array) in enumerate(_weights(_golden()).items())
     }
     found = []
-    for leaf in map(np.asarray, _leaves(triposr.load_model(TINY, numbered)).values()):
+    for leaf in map(np.asarray, _leaves(load_model(TINY, numbered)).values()):
         assert (leaf == leaf.flat[0]).all()
         found.append(int(leaf.flat[0]))
     assert len(set(found)) == len(found)
@@ -360,7 +363,7 @@ def _leaves(model):
 
 def test_half_precision_stays_close_and_keeps_half_the_memory():
     golden = _golden()
-    half = triposr.load_model(dataclasses.replace(TINY, dtype="bfloat16"), _weights(golden))
+    half = load_model(dataclasses.replace(TINY, dtype="bfloat16"), _weights(golden))
     assert {leaf.dtype for path, leaf in _leaves(half).items() if path[0] != "decoder"} == {jnp.dtype("bfloat16")}
     codes = nnx.jit(lambda model, image: model(image))(half, jnp.asarray(_photos()[0]))
     assert codes.dtype == jnp.float32
