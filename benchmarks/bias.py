@@ -48,7 +48,7 @@ def contour_errors(cloud, truth) -> np.ndarray:
     """How far the traced border as a whole is moved (x, y) and too large, in % of the diameter."""
     focal, centre = np.asarray(cloud.camera.focal, np.float64), np.asarray(cloud.camera.centre, np.float64)
     points = np.asarray(cloud.contour.points, np.float64)[np.asarray(cloud.contour.valid)]
-    conic = problems.outline(truth, focal, centre)
+    conic = problems.outline_conic(truth, focal, centre)
     along = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     slope = 2 * along @ conic
     length = np.linalg.norm(slope[:, :2], axis=1)
@@ -79,7 +79,7 @@ def frame_errors(
     )
     focal, centre = np.asarray(view.camera.focal, np.float64), np.asarray(view.camera.centre, np.float64)
     crop_from_object = camera_from_crop.to_numpy().inverse() @ scene.camera_from_object.to_numpy()
-    rgb, depth, mask = problems.picture(crop_from_object, focal, centre, resolution, resolution)
+    rgb, depth, mask = problems.draw_ellipsoid(crop_from_object, focal, centre, resolution, resolution)
     zoom = scene.matrix[[0, 1], [0, 1]] / focal  # in the middle of the image
     seen = mask & (np.asarray(view.depth) > 0)
     inner = seen.copy()

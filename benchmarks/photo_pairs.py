@@ -125,7 +125,9 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
     from ipjax.bop.evaluation import Model
     from ipjax.files.meshes.mesh import normalise
     from ipjax.rendering.render import render_scene
-    from ipjax.synthetic.scenes import HEIGHT, KINDS, WIDTH, Sensor, _expose, _sense, make_object, make_scene
+    from ipjax.synthetic.objects import KINDS, make_object
+    from ipjax.synthetic.scenes import HEIGHT, WIDTH, make_scene
+    from ipjax.synthetic.sensor import Sensor, expose, sense_depth
 
     scans = []
     if data is not None:
@@ -171,8 +173,8 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
         drawn = render_scene([(mesh, pose)], lens, HEIGHT, WIDTH, light=light)
         mask = drawn.mask[0]
         rgb = np.where(mask[..., None], drawn.rgb[0], 128).astype(np.uint8)
-        depth = _sense(rng, np.where(mask, drawn.depth[0], 2.0), lens, Sensor())
-        reference = Shot("photo", _expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rigid(rotation, translation))
+        depth = sense_depth(rng, np.where(mask, drawn.depth[0], 2.0), lens, Sensor())
+        reference = Shot("photo", expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rigid(rotation, translation))
         points = mesh.vertices[np.unique(mesh.faces)] * size
         chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
         model = Model(points[chosen], size, *none)

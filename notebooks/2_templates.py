@@ -25,7 +25,7 @@ from ipjax.files.meshes.sampling import sample_surface
 from ipjax.onboarding.mesh import framing_cameras
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.rendering.render import render
-from ipjax.synthetic.scenes import make_object
+from ipjax.synthetic.objects import make_object
 
 plt.rcParams["figure.dpi"] = 60
 mesh = make_object("mug", 1)

@@ -28,7 +28,8 @@ import ipjax
 from ipjax.cameras import project
 from ipjax.config import AlignConfig, Config, OnboardConfig
 from ipjax.onboarding.mesh import make_templates
-from ipjax.synthetic.scenes import make_object, make_scene
+from ipjax.synthetic.objects import make_object
+from ipjax.synthetic.scenes import make_scene
 
 plt.rcParams["figure.dpi"] = 60
 PATCH = 14

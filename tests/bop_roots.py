@@ -108,7 +108,7 @@ def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 1
     from PIL import Image
 
     from ipjax.records import Similarity
-    from ipjax.synthetic.problems import AXES, random_rotation, see
+    from ipjax.synthetic.problems import AXES, make_view, random_rotation
 
     size = 200.0  # mm
     ball = trimesh.creation.icosphere(subdivisions=4)
@@ -129,7 +129,7 @@ def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 1
         for image in range(images):
             rotation, shift = random_rotation(random), np.array([*random.uniform(-0.1, 0.1, 2), 0.7])
             pose = Similarity(jnp.asarray(rotation), jnp.asarray(shift), jnp.asarray(size / 1000))
-            view = see(pose, side, fill=0.6)
+            view = make_view(pose, side, fill=0.6)
             (fx, fy), (cx, cy) = np.asarray(view.camera.focal).tolist(), np.asarray(view.camera.centre).tolist()
             Image.fromarray(np.round(255 * np.asarray(view.rgb)).astype(np.uint8)).save(
                 folder / "rgb" / f"{image:06d}.png"

@@ -16,7 +16,9 @@ from ipjax.files.weights.catalogue import WeightsError
 from ipjax.files.weights.finding import resolve
 from ipjax.onboarding import mesh as onboarding
 from ipjax.synthetic import problems
-from ipjax.synthetic.scenes import PERFECT, make_object, make_scene
+from ipjax.synthetic.objects import make_object
+from ipjax.synthetic.scenes import make_scene
+from ipjax.synthetic.sensor import PERFECT
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 

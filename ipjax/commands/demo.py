@@ -24,7 +24,8 @@ from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.mesh import onboard
 from ipjax.records import Similarity
 from ipjax.synthetic.degradation import degrade
-from ipjax.synthetic.scenes import Scene, make_object, make_scene
+from ipjax.synthetic.objects import make_object
+from ipjax.synthetic.scenes import Scene, make_scene
 
 LOST = ("mug", "bottle", "corner", "wedge", "tee", "pot")  # what is looked for, by seed
 LEVEL = 2  # of degradation: smoothed, bumpy, its texture blurred

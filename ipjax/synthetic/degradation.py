@@ -1,6 +1,6 @@
 """Stand-ins for what single-view reconstruction does to a mesh, in four levels, the same on every machine.
 
-All levels work on the normalised mesh (unit diameter) and end with a rotation and a scale that nobody is told:
+All levels work on the normalised mesh (unit diameter) and end with a random rotation and scale, unknown to estimates:
 
 1. three steps of Laplacian smoothing, bumps of 1 % of the diameter (rms), texture blurred with σ = 2 texels of 1024;
 2. ten steps, bumps of 3 %, σ = 6;
@@ -9,7 +9,7 @@ All levels work on the normalised mesh (unit diameter) and end with a rotation a
 4. level 3 with bumps of 3 %, 10 % of the faces missing in patches, the mirrored back in the front's mean colour.
 
 Where a number decides which vertices or faces exist, it is kept away from ties: the grid has a random offset, and what
-lies within 1e-6 of the mirror is on it. So the topology does not hang on the last bit of a sum.
+lies within 1e-6 of the mirror is on it. So rounding, which differs between machines, cannot change the topology.
 """
 
 import dataclasses
@@ -28,7 +28,7 @@ CELLS = 24  # per diameter
 STRETCH = (1.0, 0.9, 1.1)
 MISSING = 0.1  # share of the faces
 PATCHES = 6
-BUMP_LENGTH = 0.15  # diameters; bumps are as wide as that
+BUMP_LENGTH = 0.15  # width of the bumps, diameters
 SMOOTHING = 0.5  # how far a vertex goes towards the mean of its neighbours
 
 
@@ -102,7 +102,7 @@ def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Similarity[np.
 
 @dataclasses.dataclass(frozen=True)
 class _Welded:
-    """The mesh's places: vertices that coincide move as one, or seams would open."""
+    """The mesh with coinciding vertices merged, so that they move as one and no seam opens."""
 
     place: np.ndarray  # of every vertex
     vertices: np.ndarray  # one per place
@@ -110,7 +110,7 @@ class _Welded:
 
 
 def _weld(mesh: Mesh) -> _Welded:
-    # 1e-6 of the diameter, on a grid that is nobody's symmetry plane.
+    # 1e-6 of the diameter, on a grid with an offset, so that no cell begins at a plane of symmetry.
     key = np.floor(mesh.vertices * 1e6 + 0.41421356).astype(np.int64)
     place = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
     count = int(place.max()) + 1
@@ -123,8 +123,8 @@ def _weld(mesh: Mesh) -> _Welded:
     links = sparse.coo_array((np.ones(int(proper.sum())), (a[proper], b[proper])), (count, count)).tocsr()
     links.data[:] = 1
     degree = np.asarray(links.sum(1)).reshape(-1)
-    lonely = sparse.diags_array((degree == 0).astype(np.float64))
-    average = sparse.diags_array(1 / np.maximum(degree, 1)) @ links + lonely
+    isolated = sparse.diags_array((degree == 0).astype(np.float64))
+    average = sparse.diags_array(1 / np.maximum(degree, 1)) @ links + isolated
     return _Welded(place, vertices, average.tocsr())
 
 
@@ -179,12 +179,12 @@ def _mirror(mesh: Mesh, random: np.random.Generator) -> Mesh:
     faces = [mesh.faces[(height[mesh.faces] >= 0).all(1) & above[mesh.faces].any(1)]]
     crossing = mesh.faces[above[mesh.faces].any(1) & (height[mesh.faces] < 0).any(1)]
     total = len(mesh.vertices)
-    for lonely in (True, False):
-        # Turn every triangle so that its first corner is the one above (True), or the one that is not (False).
+    for one_above in (True, False):
+        # Turn every triangle so that its first corner is the only one above (True), or the only one below (False).
         many = above[crossing].sum(1)
-        chosen = crossing[(many == 1) == lonely]
-        special = above[chosen] if lonely else ~above[chosen]
-        turn = (special.argmax(1)[:, None] + np.arange(3)) % 3
+        chosen = crossing[(many == 1) == one_above]
+        single = above[chosen] if one_above else ~above[chosen]
+        turn = (single.argmax(1)[:, None] + np.arange(3)) % 3
         a, b, c = np.take_along_axis(chosen, turn, axis=1).T
         cuts = []
         for other in (b, c):
@@ -193,7 +193,7 @@ def _mirror(mesh: Mesh, random: np.random.Generator) -> Mesh:
             colours.append(mesh.colours[a] + t * (mesh.colours[other].astype(np.float64) - mesh.colours[a]))
             cuts.append(total + np.arange(len(a)))
             total += len(a)
-        if lonely:
+        if one_above:
             faces.append(np.stack([a, cuts[0], cuts[1]], axis=-1))
         else:
             faces.append(np.stack([cuts[0], b, c], axis=-1))

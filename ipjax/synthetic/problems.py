@@ -19,7 +19,7 @@ from ipjax.records import Appearance, Camera, Patches, Query, Similarity, Surfac
 
 AXES = np.array([0.28, 0.38, 0.5])  # semi-axes; the longest makes the diameter 1
 PATCH = 14
-described = jax.jit(describe)
+_describe = jax.jit(describe)
 
 
 class CoordinateEncoder(eqx.Module):
@@ -31,14 +31,15 @@ class CoordinateEncoder(eqx.Module):
     def __call__(self, image: Float[Array, "h w 3"]) -> Float[Array, "gh gw c"]:
         height, width, _ = image.shape
         cells = image.reshape(height // PATCH, PATCH, width // PATCH, PATCH, 3)
-        inked = jnp.any(cells > 0, axis=-1, keepdims=True).astype(image.dtype)
-        mean = jnp.sum(cells * inked, axis=(1, 3)) / jnp.maximum(jnp.sum(inked, axis=(1, 3)), 1)
+        covered = jnp.any(cells > 0, axis=-1, keepdims=True).astype(image.dtype)
+        mean = jnp.sum(cells * covered, axis=(1, 3)) / jnp.maximum(jnp.sum(covered, axis=(1, 3)), 1)
         angle = jnp.sum(mean[..., :, None] * self.frequencies, axis=-2) + self.phases
         wave = jnp.cos(angle)
         return wave / jnp.linalg.norm(wave, axis=-1, keepdims=True)
 
 
 def make_encoder(channels: int = 32, seed: int = 0) -> CoordinateEncoder:
+    """The stand-in encoder with random frequencies and phases; features of ``channels`` numbers."""
     rng = np.random.default_rng(seed)
     return CoordinateEncoder(
         jnp.asarray(rng.normal(0, 5, (3, channels)), jnp.float32),
@@ -46,13 +47,13 @@ def make_encoder(channels: int = 32, seed: int = 0) -> CoordinateEncoder:
     )
 
 
-def see(camera_from_object: Similarity, side: int, fill: float = 0.83) -> View:
+def make_view(camera_from_object: Similarity, side: int, fill: float = 0.83) -> View:
     """The ellipsoid's exact image; depth in the unit of the pose's translation; the camera frames the object."""
     translation = np.asarray(camera_from_object.translation, np.float64)
     reach = 0.5 * float(camera_from_object.scale) / np.linalg.norm(translation)
     focal = fill * side / 2 / reach
     centre = middle(side, side) - focal * translation[:2] / translation[2]
-    rgb, depth, mask = picture(camera_from_object, np.array([focal, focal]), centre, side, side)
+    rgb, depth, mask = draw_ellipsoid(camera_from_object, np.array([focal, focal]), centre, side, side)
     return View(
         jnp.asarray(rgb, jnp.float32),
         jnp.asarray(depth, jnp.float32),
@@ -61,13 +62,13 @@ def see(camera_from_object: Similarity, side: int, fill: float = 0.83) -> View:
     )
 
 
-def picture(
+def draw_ellipsoid(
     camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray, height: int, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Colours, depth and mask of the ellipsoid as any pinhole sees it, exact at every pixel's centre."""
     pose = camera_from_object.to_numpy()
     translation, scale = pose.translation, float(pose.scale)
-    # Only pixels that the sphere around it can reach are worth a ray.
+    # Only pixels within the image of the sphere around it need a ray.
     reach = 0.5 * scale / (translation[2] - 0.5 * scale) * (1 + np.abs(translation[:2]).max() / translation[2])
     middle = translation[:2] / translation[2]
     low = np.clip(np.floor((middle - reach) * focal + centre), 0, [width, height]).astype(int)
@@ -92,7 +93,7 @@ def picture(
 
 @dataclasses.dataclass(frozen=True)
 class Frame:
-    """A whole image of the ellipsoid, and where it is."""
+    """A whole image of the ellipsoid, and its true pose."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
     depth: Float[np.ndarray, "h w"]  # metres
@@ -118,13 +119,13 @@ def make_frame(seed: int, height: int = 480, width: int = 640, share: tuple[floa
         jnp.asarray([*((place - centre) / focal * distance), distance], jnp.float32),
         jnp.asarray(scale, jnp.float32),
     )
-    rgb, depth, mask = picture(truth, focal, centre, height, width)
+    rgb, depth, mask = draw_ellipsoid(truth, focal, centre, height, width)
     depth[~mask] = distance + 1.5 * scale
     matrix = _matrix(focal, centre)
     return Frame(np.round(255 * rgb).astype(np.uint8), depth.astype(np.float32), mask, matrix, truth)
 
 
-def outline(camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray) -> Float[np.ndarray, "3 3"]:
+def outline_conic(camera_from_object: Similarity, focal: np.ndarray, centre: np.ndarray) -> Float[np.ndarray, "3 3"]:
     """The conic that the ellipsoid's silhouette is in the image: x̃ᵀ C x̃ = 0, negative inside."""
     # In the object's frame the dual quadric is diag(a², b², c², −1); a camera projects it to the dual conic.
     projection = _matrix(focal, centre) @ camera_from_object.to_numpy().to_matrix()[:3]
@@ -137,9 +138,10 @@ def _matrix(focal: np.ndarray, centre: np.ndarray) -> np.ndarray:
 
 
 def make_surface(count: int) -> Surface:
+    """Points of the ellipsoid with their normals, all of them seen; any prefix covers the whole surface."""
     index = np.arange(count) + 0.5
     height, angle = 1 - 2 * index / count, np.pi * (1 + 5**0.5) * index
-    order = np.random.default_rng(0).permutation(count)  # so that any prefix covers the whole surface
+    order = np.random.default_rng(0).permutation(count)
     unit = np.stack([np.sqrt(1 - height**2) * np.cos(angle), np.sqrt(1 - height**2) * np.sin(angle), height], -1)[order]
     normals = unit / AXES
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -155,8 +157,8 @@ def make_templates(directions: int = 8, rolls: int = 1, grid: int = 8, channels:
     views, patches = [], []
     for index in range(directions * rolls):
         pose = jax.tree.map(lambda x, index=index: np.asarray(x)[index], poses)
-        view = see(pose, grid * PATCH)
-        found = described(encoder, view)
+        view = make_view(pose, grid * PATCH)
+        found = _describe(encoder, view)
         inside = pose.inverse() @ found.points
         patches.append(eqx.tree_at(lambda p: p.points, found, inside))
         views.append(view.camera)
@@ -194,7 +196,8 @@ def blank_templates(views: int, patches: int, channels: int) -> Templates:
     )
 
 
-def random_rotation(rng: np.random.Generator) -> np.ndarray:
+def random_rotation(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
+    """A rotation drawn uniformly, from a normal quaternion."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
     return np.array(
         [
@@ -218,10 +221,10 @@ def make_query(
         jnp.asarray([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 1.2)], jnp.float32),
         jnp.asarray(rng.uniform(0.1, 0.3), jnp.float32),
     )
-    view = see(truth, grid * PATCH)
+    view = make_view(truth, grid * PATCH)
     hidden = jnp.asarray(np.arange(grid * PATCH) < occlusion * grid * PATCH)
     view = View(view.rgb, view.depth, view.mask & ~hidden[None, :], view.camera)
-    patches = described(make_encoder(channels), view)
+    patches = _describe(make_encoder(channels), view)
     features = patches.features + noise * jnp.asarray(
         rng.normal(size=patches.features.shape) / channels**0.5, jnp.float32
     )
@@ -230,7 +233,7 @@ def make_query(
 
 
 def make_appearance(count: int) -> Appearance:
-    """The ellipsoid's surface with the colours that `see` gives it."""
+    """The ellipsoid's surface with the colours that `make_view` gives it."""
     surface = make_surface(count)
     colours = 0.5 + 0.45 * surface.points / jnp.asarray(AXES, jnp.float32)
     return Appearance(surface.points, surface.normals, colours)

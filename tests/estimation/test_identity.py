@@ -16,7 +16,7 @@ from ipjax.inference.exporting import to_dictionary
 from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder
 from ipjax.records import Query
 from ipjax.synthetic import problems
-from ipjax.synthetic.scenes import make_object
+from ipjax.synthetic.objects import make_object
 
 PLAIN = problems.make_encoder()
 

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from ipjax.synthetic.scenes import KINDS, PERFECT, make_object, make_scene, make_texture
+from ipjax.synthetic.objects import KINDS, make_object
+from ipjax.synthetic.scenes import make_scene
+from ipjax.synthetic.sensor import PERFECT
+from ipjax.synthetic.textures import make_texture
 
 
 @pytest.fixture(scope="module")
