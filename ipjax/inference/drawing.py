@@ -8,7 +8,7 @@ import cv2
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from ipjax.cameras import project, resize, resize_pixels
 from ipjax.config import Config
@@ -17,31 +17,12 @@ from ipjax.estimation.pipeline import comparable
 from ipjax.files.cameras.reading import as_intrinsics
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import writing
-from ipjax.inference.reports import UNSURE_TURN
+from ipjax.inference.cards import INK, Evidence, draw_card, find_font, in_sixteenths, place_beside
 from ipjax.records import PoseEstimate, Query, Similarity, Templates
 
-_PALETTE = ((64, 224, 208), (255, 183, 77), (186, 104, 200), (129, 199, 132), (100, 181, 246), (240, 98, 146))
+PALETTE = ((64, 224, 208), (255, 183, 77), (186, 104, 200), (129, 199, 132), (100, 181, 246), (240, 98, 146))
 _AXES = ((239, 68, 68), (74, 222, 128), (96, 165, 250))  # x, y, z
-_PAPER, _CARD, _INK, _FAINT = (18, 20, 26), (30, 33, 42), (238, 240, 245), (150, 156, 170)
 _EDGES = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
-
-
-@dataclasses.dataclass(frozen=True)
-class Evidence:
-    """What an estimate rests on, for the panel beside the photo.
-
-    Args:
-        crop: the query's crop, RGB in [0, 1] or uint8.
-        template: the template whose pairs led to the answer; None = no picture was kept.
-        crop_points, template_points: the pairs, in pixels of the crop, and of the template if it had a single one.
-        inlier: which of the pairs agree with the pose.
-    """
-
-    crop: np.ndarray
-    template: np.ndarray | None
-    crop_points: Float[np.ndarray, "k 2"]
-    template_points: Float[np.ndarray, "k 2"]
-    inlier: Bool[np.ndarray, " k"]
 
 
 def gather_evidence(
@@ -120,14 +101,14 @@ def draw(
         [pose for pose, s in zip(poses, shown, strict=True) if s],
         [info for info, s in zip(objects, shown, strict=True) if s],
         extents=None if extents is None else [e for e, s in zip(extents, shown, strict=True) if s],
-        colours=[_PALETTE[i % len(_PALETTE)] for i, s in enumerate(shown) if s],
+        colours=[PALETTE[i % len(PALETTE)] for i, s in enumerate(shown) if s],
         height=height,
     )
     cards = [
-        _card(estimate, info, proof, _PALETTE[i % len(_PALETTE)], compact=len(objects) > 1)
-        for i, (estimate, info, proof) in enumerate(zip(estimates, objects, evidence, strict=True))
+        draw_card(estimate, info, one, PALETTE[i % len(PALETTE)], compact=len(objects) > 1)
+        for i, (estimate, info, one) in enumerate(zip(estimates, objects, evidence, strict=True))
     ]
-    return _compose(photo, cards)
+    return place_beside(photo, cards)
 
 
 def draw_overlay(
@@ -137,7 +118,7 @@ def draw_overlay(
     objects: Sequence[ObjectInfo],
     *,
     extents: Sequence[np.ndarray] | None = None,
-    colours: Sequence[tuple[int, int, int]] = _PALETTE,
+    colours: Sequence[tuple[int, int, int]] = PALETTE,
     height: int | None = None,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """The photo with the outline, the axes and the 3-D box of every object at its pose (``camera_from_object``).
@@ -201,14 +182,9 @@ def write_image(path: str | Path, image: np.ndarray) -> None:
 def _line(image: np.ndarray, a: np.ndarray, b: np.ndarray, colour, width: int, reach: float = 1e5) -> None:
     if np.abs([a, b]).max() > reach:
         return
-    start, end = _sixteenths(a), _sixteenths(b)
+    start, end = in_sixteenths(a), in_sixteenths(b)
     cv2.line(image, start, end, (10, 10, 10), width + 2, cv2.LINE_AA, 4)
     cv2.line(image, start, end, colour, width, cv2.LINE_AA, 4)
-
-
-def _sixteenths(point: np.ndarray) -> tuple[int, int]:
-    """OpenCV's fixed-point coordinates, 4 bits of fraction."""
-    return round(float(point[0]) * 16), round(float(point[1]) * 16)
 
 
 def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) -> None:
@@ -244,7 +220,7 @@ def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) 
                     cv2.addWeighted(faint, 0.4, image, 0.6, 0, image)
                 else:
                     soft = image.copy()
-                    _line(soft, pixels[a], pixels[b], _INK, 1)
+                    _line(soft, pixels[a], pixels[b], INK, 1)
                     cv2.addWeighted(soft, 0.75, image, 0.25, 0, image)
     placed = camera_from_object @ np.concatenate([np.zeros((1, 3)), 0.45 * np.eye(3)])
     if (placed[:, 2] > 1e-3).all():
@@ -259,140 +235,12 @@ def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) 
             if length > 8 and np.abs(pixels[axis + 1]).max() < 1e5:
                 x, y = pixels[axis + 1] + step / length * 7 * stroke
                 pen.text(
-                    (x, y), "xyz"[axis], _AXES[axis], _font(8 * stroke), "mm", stroke_width=2, stroke_fill=(10, 10, 10)
+                    (x, y),
+                    "xyz"[axis],
+                    _AXES[axis],
+                    find_font(8 * stroke),
+                    "mm",
+                    stroke_width=2,
+                    stroke_fill=(10, 10, 10),
                 )
         image[:] = np.asarray(canvas)
-
-
-def _font(size: int):
-    try:
-        return ImageFont.load_default(size)
-    except (TypeError, OSError):  # Pillow without FreeType has one size only
-        return ImageFont.load_default()
-
-
-def _card(estimate: PoseEstimate, info: ObjectInfo, proof: Evidence | None, colour, compact: bool) -> np.ndarray:
-    """One object: crop and template with their pairs, and the numbers below."""
-    side = 220 if compact else 300
-    gap, margin = 24, 16
-    width = 2 * side + gap + 2 * margin
-    canvas = Image.new("RGB", (width, 10_000 // 10), _CARD)
-    pen = ImageDraw.Draw(canvas)
-    y = margin
-    pen.rounded_rectangle((margin, y + 3, margin + 14, y + 17), 3, fill=colour)
-    pen.text((margin + 24, y), _shorten(info.name, 34), _INK, _font(18))
-    y += 34
-    if proof is not None:
-        canvas.paste(Image.fromarray(_pairs_picture(proof, side, gap)), (margin, y))
-        y += side + 6
-        pen = ImageDraw.Draw(canvas)
-        pen.text((margin, y), "query crop", _FAINT, _font(13))
-        chosen = f"template {int(estimate.view)}"
-        pen.text((margin + side + gap, y), chosen, _FAINT, _font(13))
-        y += 26
-    if not bool(estimate.success):
-        pen.text((margin, y), "no pose: too few pairs, or degenerate ones", (248, 113, 113), _font(16))
-        return np.asarray(canvas)[: y + 40]
-    confidence = float(estimate.confidence)
-    good = (74, 222, 128) if confidence >= 0.6 else (251, 191, 36) if confidence >= 0.3 else (248, 113, 113)
-    if not bool(estimate.present):
-        pen.text((margin, y), "not here, or not seen well enough: a guess", (248, 113, 113), _font(16))
-        y += 26
-    pen.text((margin, y), "confidence", _FAINT, _font(15))
-    left, right = margin + 110, width - margin - 52
-    pen.rounded_rectangle((left, y + 5, right, y + 15), 5, fill=_PAPER)
-    if confidence > 0.02:
-        pen.rounded_rectangle((left, y + 5, left + (right - left) * min(confidence, 1), y + 15), 5, fill=good)
-    pen.text((width - margin, y), f"{confidence:.2f}", _INK, _font(15), "ra")
-    y += 26
-    pose = estimate.camera_from_object
-    x, height_, z = (1e3 * float(v) for v in np.asarray(pose.translation))
-    pairs = 0 if proof is None else len(proof.inlier)
-    rows = [
-        ("diameter", f"{1e3 * float(pose.scale):.1f} ± {1e3 * float(estimate.scale_std):.1f} mm"),
-        ("centre in camera", f"({x:.0f}, {height_:.0f}, {z:.0f}) mm"),
-        ("inliers", f"{int(estimate.inliers)} pairs, rms {1e3 * float(estimate.rmse):.1f} mm"),
-    ]
-    turn = np.degrees(float(np.linalg.norm(np.asarray(estimate.ambiguity))))
-    if turn > UNSURE_TURN:
-        rows.append(("may be turned", f"± {turn:.0f}° about one axis"))
-    if pairs:
-        assert proof is not None
-        rows.append(("pairs shown", f"{int(proof.inlier.sum())} of {pairs} agree with the pose"))
-    for name, value in rows:
-        pen.text((margin, y), name, _FAINT, _font(15))
-        pen.text((width - margin, y), value, _INK, _font(15), "ra")
-        y += 24
-    return np.asarray(canvas)[: y + margin - 4]
-
-
-def _shorten(text: str, most: int) -> str:
-    return text if len(text) <= most else text[: most - 1] + "…"
-
-
-def _as_picture(image: np.ndarray, side: int) -> np.ndarray:
-    image = np.asarray(image)
-    if image.dtype != np.uint8:
-        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-    zoom = side / max(image.shape[:2])
-    size = (max(round(image.shape[1] * zoom), 1), max(round(image.shape[0] * zoom), 1))
-    image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if zoom < 1 else cv2.INTER_CUBIC)
-    square = np.zeros((side, side, 3), np.uint8)
-    square[: image.shape[0], : image.shape[1]] = image
-    return square
-
-
-def _pairs_picture(proof: Evidence, side: int, gap: int, most: int = 60) -> np.ndarray:
-    picture = np.full((side, 2 * side + gap, 3), _CARD, np.uint8)
-    picture[:, :side] = _as_picture(proof.crop, side)
-    if proof.template is None:
-        picture[:, side + gap :] = 0
-    else:
-        picture[:, side + gap :] = _as_picture(proof.template, side)
-    height, width = proof.crop.shape[:2]
-    longest = max(height, width)
-    a = resize_pixels(proof.crop_points, (longest, longest), (side, side))
-    b = resize_pixels(proof.template_points, (1, 1), (side, side)) + np.array([side + gap, 0])
-    # All outliers behind, inliers in front; few enough that single lines can be followed. Colour by place, so that
-    # lines which run together can be told apart.
-    outliers, inliers = np.flatnonzero(~proof.inlier), np.flatnonzero(proof.inlier)
-    for chosen, share in ((outliers, most // 4), (inliers, most)):
-        if len(chosen) > share:
-            chosen = chosen[np.linspace(0, len(chosen) - 1, share).round().astype(int)]
-        layer = picture.copy()
-        for i in chosen:
-            hue = int(179 * np.clip(a[i, 1] / side, 0, 1) * 0.85)
-            bright = cv2.cvtColor(np.array([[[hue, 190, 255]]], np.uint8), cv2.COLOR_HSV2RGB)[0, 0].tolist()
-            ink = bright if proof.inlier[i] else (150, 60, 60)
-            p, q = _sixteenths(a[i]), _sixteenths(b[i])
-            cv2.line(layer, p, q, ink, 1, cv2.LINE_AA, 4)
-            for point in (p, q):
-                cv2.circle(layer, point, 40, (10, 10, 10), -1, cv2.LINE_AA, 4)
-                cv2.circle(layer, point, 30, ink, -1, cv2.LINE_AA, 4)
-        picture = cv2.addWeighted(layer, 0.8 if chosen is not outliers else 0.5, picture, 0.2, 0)
-    return picture
-
-
-def _compose(photo: np.ndarray, cards: list[np.ndarray]) -> np.ndarray:
-    """The photo at the left, the cards in columns beside it."""
-    if not cards:
-        return photo
-    gap = 14
-    columns: list[list[np.ndarray]] = [[]]
-    for card in cards:
-        used = sum(c.shape[0] + gap for c in columns[-1])
-        if columns[-1] and used + card.shape[0] > photo.shape[0]:
-            columns.append([])
-        columns[-1].append(card)
-    tall = max(photo.shape[0], *(sum(c.shape[0] + gap for c in column) - gap for column in columns))
-    wide = photo.shape[1] + sum(gap + max(c.shape[1] for c in column) for column in columns)
-    page = np.full((tall + 2 * gap, wide + 2 * gap, 3), _PAPER, np.uint8)
-    page[gap : gap + photo.shape[0], gap : gap + photo.shape[1]] = photo
-    x = gap + photo.shape[1] + gap
-    for column in columns:
-        y = gap
-        for card in column:
-            page[y : y + card.shape[0], x : x + card.shape[1]] = card
-            y += card.shape[0] + gap
-        x += max(c.shape[1] for c in column) + gap
-    return page

@@ -37,11 +37,11 @@ class Result:
 class Estimator:
     """Objects and an encoder, ready for frames; compiles once for each shape of templates.
 
-    Templates lose their background when they are first used (`objects.compact`): the answers are the same, in about
+    Templates lose their background when they are first used (`object_file.compact`): the answers are the same, in about
     half the time for matching.
 
     Args:
-        objects: templates and what is known of them, as `objects.load` returns them.
+        objects: templates and what is known of them, as `object_file.load` returns them.
         encoder: made the templates' features.
         config: of the estimate.
         options: of `frames.frame_turned`; "square" crops by default.
@@ -62,7 +62,7 @@ class Estimator:
         self._compacted: dict[int, Templates] = {}
 
     def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
-        """The crop of one object, without looking at it yet: bad input is refused here.
+        """The crop of one object, before anything is described: bad input is refused here.
 
         Raises:
             ValueError: as `frames.frame`.
@@ -99,22 +99,23 @@ class Estimator:
 
         described: Any = patches
         if described is None:
-            see = self._ready("describe", describe, seconds, self.encoder, view)
+            describe_compiled = self._compile("describe", describe, seconds, self.encoder, view)
             start = time.perf_counter()
-            described = jax.block_until_ready(see(self.encoder, view))
+            described = jax.block_until_ready(describe_compiled(self.encoder, view))
             seconds["describe"] = time.perf_counter() - start
 
         query = Query(patches=described, view=view)
         arguments = self.encoder, templates, query, key, self.config, known
-        find = self._ready("estimate", estimate, seconds, *arguments)
+        estimate_compiled = self._compile("estimate", estimate, seconds, *arguments)
         start = time.perf_counter()
-        found = jax.block_until_ready(find(*arguments))
+        found = jax.block_until_ready(estimate_compiled(*arguments))
         seconds["estimate"] = time.perf_counter() - start
-        found, doubt = doubt_size(found, info, diameter, self.config.confidence.least)
-        warnings = (doubt,) if doubt else ()
-        return Result(_turn(camera_from_crop, found), found, query, templates, info, seconds, warnings)
+        found, warning = check_size(found, info, diameter, self.config.confidence.least)
+        warnings = (warning,) if warning else ()
+        whole = to_image_camera(camera_from_crop, found)
+        return Result(whole, found, query, templates, info, seconds, warnings)
 
-    def _ready(self, name: str, function: Any, seconds: dict[str, float], *args: Any):
+    def _compile(self, name: str, function: Any, seconds: dict[str, float], *args: Any):
         leaves, structure = jax.tree.flatten(args)
         shapes = tuple((np.shape(x), str(getattr(x, "dtype", type(x)))) for x in leaves)
         key = (name, structure, shapes)
@@ -125,7 +126,7 @@ class Estimator:
         return self._compiled[key]
 
 
-def doubt_size(
+def check_size(
     found: PoseEstimate, info: ObjectInfo, diameter: float | None = None, least: float = 0.5
 ) -> tuple[PoseEstimate, str]:
     """The estimate with less confidence where its size is not the one that the mesh file says.
@@ -147,13 +148,13 @@ def doubt_size(
     if not (np.isfinite(size) and size > 0):
         return found, ""
     ratio = size / known
-    doubt = abs(np.log(ratio)) / np.log(1.25)
-    if doubt <= 1:
+    deviation = abs(np.log(ratio)) / np.log(1.25)
+    if deviation <= 1:
         return found, ""
     compared = f"{1e3 * size:.4g} mm, {ratio:.3g} times the {1e3 * known:.4g} mm of its mesh file"
     if diameter is not None:
         return found, f"{info.name}: the diameter given is {compared}"
-    confidence = jnp.asarray(float(found.confidence) * np.exp(-0.5 * doubt**2), found.confidence.dtype)
+    confidence = jnp.asarray(float(found.confidence) * np.exp(-0.5 * deviation**2), found.confidence.dtype)
     found = dataclasses.replace(found, confidence=confidence, present=found.present & (confidence >= least))
     return found, (
         f"{info.name}: the size found is {compared}: is the camera matrix of images of another size, the unit of the "
@@ -161,7 +162,7 @@ def doubt_size(
     )
 
 
-def _turn(camera_from_crop: Similarity, found: PoseEstimate) -> PoseEstimate:
+def to_image_camera(camera_from_crop: Similarity, found: PoseEstimate) -> PoseEstimate:
     """The estimate in the camera of the whole image: the crop's camera is only turned."""
     host = camera_from_crop.to_numpy()
     turn = host.rotation

@@ -20,7 +20,7 @@ from ipjax.onboarding.reconstructed import Reconstruction
 from ipjax.records import Camera, Similarity
 
 if TYPE_CHECKING:
-    from ipjax.networks.triposr import TripoSR
+    from ipjax.networks.triposr.model import TripoSR
     from ipjax.onboarding.foreground import Foreground
 
 # https://huggingface.co/stabilityai/TripoSR, MIT; the sum is pinned alike by several public installers.
@@ -121,7 +121,8 @@ def load_triposr(path: str | Path, *, dtype: str = "float32") -> "TripoSR":
     ``dtype`` "bfloat16" halves the memory. Raises WeightsError in one sentence when the file is not this model's.
     """
     from ipjax.files.weights.pickles import read_pth
-    from ipjax.networks.triposr import TripoSRConfig, load_model
+    from ipjax.networks.triposr.config import TripoSRConfig
+    from ipjax.networks.triposr.weights import load_model
 
     try:
         return load_model(TripoSRConfig(dtype=dtype), read_pth(path))
@@ -139,7 +140,7 @@ def reconstruct_with_triposr(
     import jax.numpy as jnp
     from flax import nnx
 
-    from ipjax.networks.triposr import prepare_image
+    from ipjax.networks.triposr.model import prepare_image
     from ipjax.onboarding.foreground import composite_grey, crop_foreground
 
     tell = progress or (lambda stage, share: None)
@@ -203,7 +204,7 @@ def extract_mesh(
     import jax.numpy as jnp
     from flax import nnx
 
-    from ipjax.networks.triposr import density_grid, query
+    from ipjax.networks.triposr.field import density_grid, query
 
     tell = progress or (lambda stage, share: None)
     # The window slides back at the end rather than change its size: one shape, one compilation.

@@ -19,7 +19,7 @@ from ipjax.estimation.confidence import probability
 from ipjax.files.settings import describe_config, read_config
 from ipjax.records import Agreement, Similarity
 from ipjax.synthetic.degradation import degrade
-from ipjax.synthetic.scenes import make_object
+from ipjax.synthetic.objects import make_object
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = {

@@ -10,7 +10,8 @@ from estimates import make_estimate
 from PIL import Image
 
 from ipjax.files.objects.record import ObjectInfo
-from ipjax.inference.drawing import Evidence, draw, draw_overlay, silhouette, write_image
+from ipjax.inference.cards import Evidence
+from ipjax.inference.drawing import draw, draw_overlay, silhouette, write_image
 from ipjax.records import Similarity
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])

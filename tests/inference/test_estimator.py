@@ -9,7 +9,7 @@ from estimates import make_estimate
 
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.batching import compact
-from ipjax.inference.estimator import MULTIPLE, Estimator, _turn
+from ipjax.inference.estimator import MULTIPLE, Estimator, to_image_camera
 from ipjax.inference.exporting import blank_query
 from ipjax.records import Patches, Query, Similarity
 from ipjax.synthetic import problems
@@ -20,7 +20,7 @@ def test_pose_alternatives_and_covariance_turn_together():
     turn, rotation = (problems.random_rotation(rng) for _ in range(2))
     single = lambda x: jnp.asarray(x, jnp.float32)
     found = make_estimate(Similarity(single(rotation), single([0.1, 0.0, 0.8]), single(0.2)))
-    turned = _turn(Similarity(single(turn), jnp.zeros(3), single(1.0)), found)
+    turned = to_image_camera(Similarity(single(turn), jnp.zeros(3), single(1.0)), found)
     np.testing.assert_allclose(turned.camera_from_object.rotation, turn @ rotation, atol=1e-6)
     np.testing.assert_allclose(turned.camera_from_object.translation, turn @ [0.1, 0.0, 0.8], atol=1e-6)
     np.testing.assert_allclose(turned.hypotheses.camera_from_object.rotation[0], turn @ rotation, atol=1e-6)
@@ -67,7 +67,7 @@ def test_the_estimator_compares_compacted_templates(monkeypatch):
         seconds[name] = 0.0
         return lambda *_: make_estimate(still)
 
-    monkeypatch.setattr(Estimator, "_ready", ready)
+    monkeypatch.setattr(Estimator, "_compile", ready)
     estimator = Estimator([(whole, info)], None)
     for _ in range(2):
         result = estimator.run(0, query.view, still, patches=query.patches)

@@ -16,7 +16,8 @@ from ipjax.files.cameras.reading import read_camera
 from ipjax.files.images.depth import read_depth
 from ipjax.files.images.masks import as_mask, read_mask
 from ipjax.files.images.opening import read_rgb
-from ipjax.inference.frames import clean_depth, frame, frame_turned
+from ipjax.inference.depth import clean_depth
+from ipjax.inference.frames import frame, frame_turned
 from ipjax.records import Camera
 
 HEIGHT, WIDTH = 96, 128

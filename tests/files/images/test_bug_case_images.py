@@ -78,7 +78,7 @@ TOLD = {
     "k_centre_swapped.json": "look exchanged",
     "k_far.json": "far from the middle",
 }
-# Of these, only the size of the mesh can tell: see `estimation.doubt_size`.
+# Of these, only the size of the mesh can tell: see `inference.estimator.check_size`.
 SILENT = ("k_fx0.5,_centre_right.json", "k_fx1.2,_centre_right.json")
 MASKS = {
     **{f"mask_palette/{n}": 14952 for n in ("adaptive.png", "convertP.png", "index0_is_white.png", "mask.gif")},
