@@ -29,7 +29,7 @@ def main() -> None:
     from ipjax.networks.triposr.config import TripoSRConfig
     from ipjax.networks.triposr.field import density_grid, query
     from ipjax.networks.triposr.model import TripoSR, prepare_image
-    from ipjax.onboarding.reconstruction import find_surface
+    from ipjax.onboarding.reconstruction.triposr import find_surface
 
     seconds: dict[str, float] = {}
     start = last = time.perf_counter()

@@ -262,7 +262,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
     }
     photo = None
     if is_photo:
-        from ipjax.onboarding.photo import onboard_photo, take_shot
+        from ipjax.onboarding.photo import onboard_photo, prepare_photo
 
         given = {name: getattr(arguments, name) for name in ("mask", "box", "click", "depth", "depth_scale")}
         given["camera"] = _read_photo_camera(arguments)
@@ -273,7 +273,7 @@ def _onboard(arguments: argparse.Namespace) -> int:
 
             given["mask"] = read_mask(arguments.mask, arguments.mask_label)
         given["tried"] = output.with_suffix(".tried.png")
-        take_shot(source, **given)  # a bad photo is refused before weights are loaded and anything is compiled
+        prepare_photo(source, **given)  # a bad photo is refused before weights are loaded and anything is compiled
         encoder = _load_encoder(arguments)
         use_compilation_cache()
         lrm = {"lrm": arguments.lrm or "auto", "lrm_weights": arguments.lrm_weights}
@@ -295,7 +295,8 @@ def _onboard(arguments: argparse.Namespace) -> int:
         from ipjax.files.meshes.cleaning import clean
         from ipjax.files.meshes.loading import load_mesh
         from ipjax.files.meshes.mesh import normalise
-        from ipjax.onboarding.report import examine, write_report
+        from ipjax.onboarding.report.findings import examine
+        from ipjax.onboarding.report.page import write_report
 
         mesh = normalise(clean(load_mesh(source) if photo is None else photo.reconstruction.mesh)[0])
         found = examine(templates, info, mesh, encoder, config, backend=arguments.backend)

@@ -74,7 +74,7 @@ def box_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
     except QhullError:  # flat
         corners = np.arange(len(points))
     if len(corners) > _CORNERS:
-        # A smooth surface is nothing but corners, and the search looks at all of them from every side.
+        # On a smooth surface every vertex is a corner of the hull, and the search tries all of them in all directions.
         points = points[corners]
         index = np.arange(_CORNERS)
         height, angle = 1 - (2 * index + 1) / _CORNERS, np.pi * (1 + 5**0.5) * index
@@ -123,28 +123,30 @@ def make_templates(
     views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)
     views = dataclasses.replace(views, camera=jax.tree.map(np.asarray, cameras))
     surface = Surface(*(jnp.asarray(x, jnp.float32) for x in sample_surface(mesh, config.surface, seed=0)))
-    held = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
+    poses_on_host = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
 
-    def see(index: int) -> tuple[Patches, Array]:
-        pose = jax.tree.map(lambda x: x[index], held)
+    def describe_view(index: int) -> tuple[Patches, Array]:
+        pose = jax.tree.map(lambda x: x[index], poses_on_host)
         camera = Camera(jnp.asarray(views.camera.focal[index]), jnp.asarray(views.camera.centre[index]))
         rgb = views.rgb[index].astype(np.float32) / 255
         view = View(jnp.asarray(rgb), jnp.asarray(views.depth[index]), jnp.asarray(views.mask[index]), camera)
-        return jax.block_until_ready(look(encoder, view, pose, surface, config.describe))
+        return jax.block_until_ready(describe_compiled(encoder, view, pose, surface, config.describe))
 
-    look, workers = _describe_view, 1
+    describe_compiled, workers = _describe_view, 1
     if jax.default_backend() == "cpu":
         # One view per core is faster than one view on all cores, most of all where cores are shared with others.
-        look = _describe_view_on_one_core
+        describe_compiled = _describe_view_on_one_core
         workers = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
     patches, seen = [], []
     with ThreadPoolExecutor(workers) as pool:
         try:
-            found = pool.map(see, range(len(poses.scale)))
-            for one, sure in bar(found, desc="describing", total=len(poses.scale), unit="view", disable=not progress):
+            found = pool.map(describe_view, range(len(poses.scale)))
+            for one, seen_share in bar(
+                found, desc="describing", total=len(poses.scale), unit="view", disable=not progress
+            ):
                 patches.append(one)
-                seen.append(sure)
-        except BaseException:  # Ctrl-C too: what has not begun need not be
+                seen.append(seen_share)
+        except BaseException:  # Ctrl-C too: views that have not begun are not needed
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     patches, mean, norm = jax.jit(centre)(jax.tree.map(lambda *x: jnp.stack(x), *patches))
@@ -202,14 +204,14 @@ def onboard(
 
     Args:
       source: a mesh file (OBJ, PLY, GLB, glTF, STL) or a ``Mesh``.
-      encoder: default: the best weights that are here (``load_encoder()``).
+      encoder: default: the best weights on this machine (``load_encoder()``).
       out: also write the object file.
       name: default: the file's.
       metres_per_unit: the mesh file's unit, where it is known; then the object's size is, too.
-      backend: who renders: ``auto``, ``egl``, ``osmesa``, ``native`` or ``raster``.
+      backend: the renderer: ``auto``, ``egl``, ``osmesa``, ``native`` or ``raster``.
 
     Raises:
-      ValueError: what is not a mesh, or weights that cannot be had; in words.
+      ValueError: what is not a mesh, or weights that are not there; in words.
     """
     encoder = load_encoder() if encoder is None else encoder
     path = None if isinstance(source, Mesh) else Path(source)

@@ -19,12 +19,14 @@ from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.catalogue import WeightsError
 from ipjax.files.weights.hashes import hash_file
-from ipjax.inference import frames
+from ipjax.inference.cutting import undistort_frame
+from ipjax.inference.depth import check_depth_unit, find_depth_scale, sample_depth, to_metres
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo
 from ipjax.onboarding.mesh import onboard
-from ipjax.onboarding.reconstructed import Reconstruction
-from ipjax.onboarding.reconstruction import Progress, load_triposr, reconstruct, resolve_triposr
+from ipjax.onboarding.reconstruction.reconstruct import reconstruct
+from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
+from ipjax.onboarding.reconstruction.triposr import load_triposr, resolve_triposr
 from ipjax.records import Camera, Templates
 
 log = logging.getLogger("ipjax")
@@ -44,8 +46,8 @@ class PhotoObject:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
-    """A photo with its mask, and its depth and camera where they are known; all of one size."""
+class PreparedPhoto:
+    """A photo with its mask, and its depth and camera where they are known: all of one size, the lens undone."""
 
     foreground: Foreground
     depth: np.ndarray | None  # along z, metres, 0 = unknown
@@ -75,7 +77,7 @@ def onboard_photo(
 
     Args:
       source: a photo's file, or a `Photo`.
-      encoder: default: the best weights that are here.
+      encoder: default: the best weights on this machine.
       mask: file, or height × width: the object. Default: transparency, ``box``, ``click``, or a plain background.
       box: (x, y, width, height) around the object, pixels of the photo's file.
       click: (x, y) on the object, likewise.
@@ -92,10 +94,10 @@ def onboard_photo(
     Raises:
       ValueError: no usable photo, mask, depth, camera or weights; one sentence.
     """
-    shot = take_shot(
+    prepared = prepare_photo(
         source, mask=mask, box=box, click=click, depth=depth, camera=camera, depth_scale=depth_scale, tried=tried
     )
-    made, method = _reconstruct(shot, lrm, lrm_weights, _say if progress else None)
+    made, method = _reconstruct(prepared, lrm, lrm_weights, _print_progress if progress else None)
     path = None if isinstance(source, Photo) else Path(source)
     name = name or (path.stem if path else "object")
     templates, info = onboard(made.mesh, encoder, config, name=name, progress=progress, backend=backend)
@@ -105,14 +107,14 @@ def onboard_photo(
         mesh_sha256=hash_file(path) if path else "",
         metres_per_unit=1.0 if made.metric else None,
         notes=(*made.report, *info.notes),
-        reference=_describe(path, shot, made, method, info, templates),
+        reference=_describe(path, prepared, made, method, info, templates),
     )
     if out is not None:
         save(out, templates, info)
-    return PhotoObject(templates, info, shot.foreground, made)
+    return PhotoObject(templates, info, prepared.foreground, made)
 
 
-def take_shot(
+def prepare_photo(
     source: str | Path | Photo,
     *,
     mask: Any = None,
@@ -122,7 +124,7 @@ def take_shot(
     camera: Any = None,
     depth_scale: float | None = None,
     tried: str | Path | None = None,
-) -> Shot:
+) -> PreparedPhoto:
     """Read a photo with all that belongs to it, find the object in it, and undo the lens; see `onboard_photo`.
 
     Raises ValueError in one sentence: whatever is unreadable, does not fit, or has no unit.
@@ -132,11 +134,12 @@ def take_shot(
     if sum(option is not None for option in (mask, box, click)) > 1:
         raise ValueError("give one of mask, box and click, not several")
     photo = source if isinstance(source, Photo) else read_photo(source)
-    beside = [name for name, value in (("mask", mask), ("depth", depth), ("camera", camera)) if value is not None]
-    if photo.orientation != 1 and beside and not isinstance(source, Photo):
+    companions = [name for name, value in (("mask", mask), ("depth", depth), ("camera", camera)) if value is not None]
+    if photo.orientation != 1 and companions and not isinstance(source, Photo):
         raise ValueError(
             f"{source}: its EXIF orientation ({photo.orientation}) says that it is to be shown turned, and nothing "
-            f"says whether {' and '.join(beside)} belong to it as stored or as shown; save all of them the same way up"
+            f"says whether {' and '.join(companions)} belong to it as stored or as shown; save all of them the same "
+            "way up"
         )
     mask = read_mask(mask) if isinstance(mask, str | Path) else mask
     depth = read_depth(depth) if isinstance(depth, str | Path) else depth
@@ -166,12 +169,12 @@ def take_shot(
         assert intrinsics is not None
         metres = _to_metres(np.asarray(depth), foreground.mask, photo.scale, depth_scale, intrinsics)
     if intrinsics is None:
-        return Shot(foreground, None, None)
+        return PreparedPhoto(foreground, None, None)
     whole = photo.full_size or (width / photo.scale, height / photo.scale)
     intrinsics = dataclasses.replace(intrinsics, matrix=resize(intrinsics.matrix, whole, (width, height)))
     if intrinsics.distortion:
         nothing = np.zeros((height, width), np.float32)
-        rgb, metres_, found, _ = frames._undistort(
+        rgb, metres_, found, _ = undistort_frame(
             foreground.rgb, nothing if metres is None else metres, foreground.mask, None, intrinsics
         )
         metres = None if depth is None else metres_
@@ -182,7 +185,7 @@ def take_shot(
             alpha=np.uint8(255) * np.asarray(found, np.uint8),
             notes=(*foreground.notes, "the lens's distortion was undone"),
         )
-    return Shot(foreground, metres, intrinsics.camera)
+    return PreparedPhoto(foreground, metres, intrinsics.camera)
 
 
 def _to_metres(
@@ -196,7 +199,7 @@ def _to_metres(
     if unknown:
         log.info("%s", unknown)
     height, width = mask.shape
-    unit = frames._depth_scale(depth, depth_scale, intrinsics)
+    unit = find_depth_scale(depth, depth_scale, intrinsics)
     if depth.shape != mask.shape:
         if any(abs(d * scale - p) > 1.0 for d, p in zip(depth.shape, mask.shape, strict=True)):
             raise ValueError(
@@ -208,19 +211,19 @@ def _to_metres(
             for before, after in zip(depth.shape[::-1], (width, height), strict=True)
         )
         known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-        depth = frames.sample_depth(known, wide[None, :], high[:, None])
-    frames._check_unit(depth, mask, (0, 0, width, height), unit)
-    return frames._metres(depth, unit)
+        depth = sample_depth(known, wide[None, :], high[:, None])
+    check_depth_unit(depth, mask, (0, 0, width, height), unit)
+    return to_metres(depth, unit)
 
 
 def _reconstruct(
-    shot: Shot, lrm: str, weights: str | Path | None, progress: Progress | None
+    prepared: PreparedPhoto, lrm: str, weights: str | Path | None, progress: Progress | None
 ) -> tuple[Reconstruction, str]:
-    """The mesh, and who made it: "triposr", "depth" or "inflate"."""
+    """The mesh, and the method that made it: "triposr", "depth" or "inflate"."""
     if lrm not in ("auto", "triposr", "inflate"):
         raise ValueError(f"the reconstruction is 'auto', 'triposr' or 'inflate', not {lrm!r}")
     model, missing = None, ""
-    if lrm == "triposr" or (lrm == "auto" and shot.depth is None):
+    if lrm == "triposr" or (lrm == "auto" and prepared.depth is None):
         try:
             model = load_triposr(resolve_triposr(weights).path)
         except WeightsError:
@@ -228,26 +231,31 @@ def _reconstruct(
                 raise
             missing = "TripoSR's weights are not here, so the mesh was made without learned weights"
     made = reconstruct(
-        shot.foreground, method=lrm, depth=shot.depth, camera=shot.camera, model=model, progress=progress
+        prepared.foreground, method=lrm, depth=prepared.depth, camera=prepared.camera, model=model, progress=progress
     )
     if missing:
         made = dataclasses.replace(made, report=(*made.report, missing))
-    return made, "triposr" if model is not None else "depth" if shot.depth is not None else "inflate"
+    return made, "triposr" if model is not None else "depth" if prepared.depth is not None else "inflate"
 
 
-def _say(stage: str, share: float) -> None:
+def _print_progress(stage: str, share: float) -> None:
     print(f"\rreconstructing: {stage} {share:.0%}  ", end="\n" if share >= 1 else "", flush=True)
 
 
 def _describe(
-    path: Path | None, shot: Shot, made: Reconstruction, method: str, info: ObjectInfo, templates: Templates
+    path: Path | None,
+    prepared: PreparedPhoto,
+    made: Reconstruction,
+    method: str,
+    info: ObjectInfo,
+    templates: Templates,
 ) -> Reference | None:
     import cv2
 
     if made.camera_from_mesh is None or made.camera is None:
         return None
     pose, lens = made.camera_from_mesh, made.camera
-    image = shot.foreground.rgb
+    image = prepared.foreground.rgb
     height, width = image.shape[:2]
     zoom = min(1.0, _PICTURE / max(height, width))
     small = cv2.resize(image, (max(1, round(width * zoom)), max(1, round(height * zoom))), interpolation=cv2.INTER_AREA)
@@ -262,7 +270,7 @@ def _describe(
         focal=(float(focal[0]), float(focal[1])),
         centre=(float(centre[0]), float(centre[1])),
         size=(int(width), int(height)),
-        camera_given=shot.camera is not None and method != "triposr",
+        camera_given=prepared.camera is not None and method != "triposr",
         metric=made.metric,
         method=method,
         seen=float(np.asarray(templates.surface.seen).mean()),

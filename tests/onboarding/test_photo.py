@@ -22,8 +22,9 @@ from ipjax.files.objects.saving import save
 from ipjax.inference.reports import CONVENTIONS, relative_pose, tell_relative_pose
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.onboarding import photo as photos
-from ipjax.onboarding import report as onboarding_report
 from ipjax.onboarding.foreground import Photo
+from ipjax.onboarding.report import findings
+from ipjax.onboarding.report.page import write_report
 from ipjax.records import Similarity
 
 HEIGHT, WIDTH, FOCAL = 120, 160, 300.0
@@ -127,11 +128,11 @@ def test_a_reduced_photo_keeps_its_camera_and_depth():
     """The same ray hits the same surface, before and after the photo was halved."""
     rgb, mask, depth = ball()
     half = Photo(rgb[::2, ::2].copy(), scale=0.5)
-    shot = photos.take_shot(half, mask=mask, depth=(1e3 * depth).astype(np.uint16), camera=K, depth_scale=1e-3)
-    assert shot.depth.shape == (HEIGHT // 2, WIDTH // 2)
-    assert shot.depth[30, 40] == pytest.approx(0.54, abs=0.002)
-    np.testing.assert_allclose(np.asarray(shot.camera.focal), FOCAL / 2)
-    np.testing.assert_allclose(np.asarray(shot.camera.centre), [(79.5 + 0.5) / 2 - 0.5, (59.5 + 0.5) / 2 - 0.5])
+    prepared = photos.prepare_photo(half, mask=mask, depth=(1e3 * depth).astype(np.uint16), camera=K, depth_scale=1e-3)
+    assert prepared.depth.shape == (HEIGHT // 2, WIDTH // 2)
+    assert prepared.depth[30, 40] == pytest.approx(0.54, abs=0.002)
+    np.testing.assert_allclose(np.asarray(prepared.camera.focal), FOCAL / 2)
+    np.testing.assert_allclose(np.asarray(prepared.camera.centre), [(79.5 + 0.5) / 2 - 0.5, (59.5 + 0.5) / 2 - 0.5])
 
 
 def test_a_lens_is_undone():
@@ -146,14 +147,14 @@ def test_a_lens_is_undone():
     column, row = (np.rint(ray[k] * FOCAL + middle).astype(int) for k, middle in enumerate((79.5, 59.5)))
     seen = lambda image: image[np.clip(row, 0, HEIGHT - 1), np.clip(column, 0, WIDTH - 1)]
     lens = Intrinsics(K, (-1.0, 0.5, 0.0, 0.0, 0.0), "plumb_bob")
-    shot = photos.take_shot(Photo(seen(straight)), mask=seen(mask), depth=seen(depth), camera=lens)
-    assert any("lens" in note for note in shot.foreground.notes)
+    prepared = photos.prepare_photo(Photo(seen(straight)), mask=seen(mask), depth=seen(depth), camera=lens)
+    assert any("lens" in note for note in prepared.foreground.notes)
     middle = np.s_[15:105, 20:140]
     off = lambda image: np.abs(image.astype(int) - straight.astype(int))[middle].max()
-    assert off(shot.foreground.rgb) <= 3 and off(seen(straight)) > 6
-    both = mask & shot.foreground.mask
-    assert both.sum() > 0.97 * mask.sum() and shot.foreground.mask.sum() < 1.03 * mask.sum()
-    assert np.median(np.abs(shot.depth - depth)[both]) < 1e-3
+    assert off(prepared.foreground.rgb) <= 3 and off(seen(straight)) > 6
+    both = mask & prepared.foreground.mask
+    assert both.sum() > 0.97 * mask.sum() and prepared.foreground.mask.sum() < 1.03 * mask.sum()
+    assert np.median(np.abs(prepared.depth - depth)[both]) < 1e-3
 
 
 BAD = {
@@ -179,7 +180,7 @@ def test_bad_shots_are_refused_in_words(case):
         millimetres = (1e3 * depth).astype(np.uint16)
         given["depth"] = (depth, depth[:50], millimetres, np.zeros_like(depth))[given["depth"]]
     with pytest.raises(ValueError, match=words):
-        photos.take_shot(Photo(rgb), **given)
+        photos.prepare_photo(Photo(rgb), **given)
 
 
 def test_triposr_without_weights_is_refused_but_auto_goes_on(encoder, monkeypatch, tmp_path):
@@ -188,7 +189,7 @@ def test_triposr_without_weights_is_refused_but_auto_goes_on(encoder, monkeypatc
     rgb, mask, _ = ball()
     with pytest.raises(ValueError, match="weights of TripoSR are not here"):
         photos.onboard_photo(Photo(rgb), encoder, CONFIG, mask=mask, lrm="triposr", progress=False)
-    made, method = photos._reconstruct(photos.take_shot(Photo(rgb), mask=mask), "auto", None, None)
+    made, method = photos._reconstruct(photos.prepare_photo(Photo(rgb), mask=mask), "auto", None, None)
     assert method == "inflate" and not made.metric
     assert any("TripoSR's weights are not here" in line for line in made.report)
 
@@ -197,11 +198,11 @@ def test_triposr_without_weights_is_refused_but_auto_goes_on(encoder, monkeypatc
 
 
 def test_turns_that_look_alike_are_found():
-    steps = np.arange(onboarding_report.STEPS)
-    plain = np.full(onboarding_report.STEPS, 0.95)
+    steps = np.arange(findings.STEPS)
+    plain = np.full(findings.STEPS, 0.95)
     told = np.where(steps == 0, 1.0, np.where((steps == 1) | (steps == 11), 0.7, 0.2))
     half = np.where(steps == 6, 0.85, told)
-    found = onboarding_report.find_ambiguous(np.stack([plain, told, half]))
+    found = findings.find_ambiguous(np.stack([plain, told, half]))
     assert found == ((60, 90, 120, 150, 180), (), (180,))
 
 
@@ -211,16 +212,16 @@ def test_the_report_needs_nothing_beside_it_and_says_what_matters(metric, encode
 
     mesh = normalise(clean(metric.reconstruction.mesh)[0])
     axes = np.asarray(metric.templates.axes, np.float64)
-    poses = onboarding_report._circling(axes, 3.0)
+    poses = findings.poses_around_axes(axes, 3.0)
     eyes = -np.einsum("vij,vi->vj", np.asarray(poses.rotation), np.asarray(poses.translation))
     # Views of one end stand on a circle about their axis.
-    np.testing.assert_allclose((eyes[:12] @ axes[0]), 3 * np.sin(np.deg2rad(onboarding_report.TILT)), atol=1e-5)
+    np.testing.assert_allclose((eyes[:12] @ axes[0]), 3 * np.sin(np.deg2rad(findings.TILT)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(np.asarray(poses.rotation)), 1, atol=1e-5)
-    found = onboarding_report.Findings(
+    found = findings.Findings(
         np.full((3, 12), 0.9), ((180,), (), ()), np.array([0.5, 0.6, 0.7]), 9.0, ("symmetric: <so it is>",)
     )
     path = tmp_path / "r.html"
-    onboarding_report.write_report(path, metric.templates, metric.info, mesh, found, metric)
+    write_report(path, metric.templates, metric.info, mesh, found, metric)
     text = path.read_text()
     assert not re.search(r"(src|href)=\"(?!data:)|url\(|<script", text)
     for words in ("symmetric: &lt;so it is&gt;", "mm (measured)", "no learned weights", "front (the photo)", "guessed"):
@@ -230,9 +231,9 @@ def test_the_report_needs_nothing_beside_it_and_says_what_matters(metric, encode
 
 def test_thin_and_textureless_objects_are_warned_of(metric):
     info = dataclasses.replace(metric.info, pictures=np.full((4, 56, 56, 3), 90, np.uint8))
-    texture = onboarding_report.measure_texture(info)
-    assert texture < 0.1 < onboarding_report.measure_texture(metric.info)
-    told = onboarding_report._warn(
+    texture = findings.measure_texture(info)
+    assert texture < 0.1 < findings.measure_texture(metric.info)
+    told = findings.list_warnings(
         metric.templates, info, np.array([0.02, 0.5, 0.8]), ((), (60, 90, 120, 150, 180), ()), texture
     )
     assert any("thin" in line for line in told) and any("textureless" in line for line in told)

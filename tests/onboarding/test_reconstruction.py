@@ -13,9 +13,21 @@ from golden.make_triposr import unpack
 
 from ipjax.files.meshes.textures import sample_texture
 from ipjax.files.weights.catalogue import WeightsError
-from ipjax.networks import triposr
-from ipjax.onboarding import inflation, reconstruction
+from ipjax.networks.triposr.model import TripoSR
+from ipjax.networks.triposr.weights import official_shapes
 from ipjax.onboarding.foreground import Photo, find_foreground
+from ipjax.onboarding.reconstruction.completion import complete_depth
+from ipjax.onboarding.reconstruction.inflation import bulge, inflate_photo
+from ipjax.onboarding.reconstruction.outline import look_up, trace_outline
+from ipjax.onboarding.reconstruction.reconstruct import reconstruct
+from ipjax.onboarding.reconstruction.symmetry import find_plane
+from ipjax.onboarding.reconstruction.triposr import (
+    TRIPOSR,
+    extract_mesh,
+    find_surface,
+    load_triposr,
+    resolve_triposr,
+)
 from ipjax.records import Camera
 
 HEIGHT, WIDTH, FOCAL = 120, 160, 300.0
@@ -65,16 +77,16 @@ def test_an_inflated_disc_is_a_ball_and_a_strip_is_not_deeper_than_it_is_wide():
     for radius in (15.5, 30.5):
         inside = x**2 + y**2 < radius**2
         expected = np.sqrt(np.maximum(radius**2 - x**2 - y**2, 0))
-        deep = inflation.bulge(inside, 1.0)
+        deep = bulge(inside, 1.0)
         assert np.abs(deep - expected)[x**2 + y**2 < (0.9 * radius) ** 2].max() < 0.06 * radius
-        np.testing.assert_allclose(inflation.bulge(inside, 0.5), 0.5 * deep, atol=1e-9)
+        np.testing.assert_allclose(bulge(inside, 0.5), 0.5 * deep, atol=1e-9)
     strip = np.abs(x) < 8
-    assert inflation.bulge(strip, 1.0).max() < 2**0.5 * 8.5
+    assert bulge(strip, 1.0).max() < 2**0.5 * 8.5
 
 
 def test_inflation_of_a_photo():
     rgb, mask, _ = _ball()
-    made = inflation.inflate_photo(rgb, mask, camera=CAMERA)
+    made = inflate_photo(rgb, mask, camera=CAMERA)
     assert not made.metric
     _check(made, rgb, mask)
     extent = np.ptp(made.mesh.vertices, axis=0)
@@ -83,7 +95,7 @@ def test_inflation_of_a_photo():
     half = len(made.mesh.vertices) // 2
     np.testing.assert_array_equal(made.mesh.uv[:half], made.mesh.uv[half:])
     assert made.mesh.seen[half:].max() == 0
-    assert any("assumed" in line for line in inflation.inflate_photo(rgb, mask).report)
+    assert any("assumed" in line for line in inflate_photo(rgb, mask).report)
 
 
 @pytest.mark.parametrize("back", ["inflate", "mirror", "auto"])
@@ -91,13 +103,13 @@ def test_completed_depth_is_metric_and_keeps_the_measured_front(back):
     rgb, mask, depth = _ball()
     noisy = depth + np.random.default_rng(0).normal(0, 0.0005, depth.shape)
     noisy[50:56, 70:80] = 0  # a hole
-    made = inflation.complete_depth(rgb, mask, noisy, CAMERA, back=back)
+    made = complete_depth(rgb, mask, noisy, CAMERA, back=back)
     assert made.metric
     _check(made, rgb, mask)
     pixels, points = _project(made, made.mesh.vertices)
     seen = made.mesh.seen == 1
-    measured = inflation.look_up(depth.astype(np.float32), pixels[seen])
-    inner = inflation.look_up(mask.astype(np.float32), pixels[seen]) > 0.999
+    measured = look_up(depth.astype(np.float32), pixels[seen])
+    inner = look_up(mask.astype(np.float32), pixels[seen]) > 0.999
     assert np.percentile(np.abs(points[seen, 2] - measured)[inner], 90) < 0.002
     to_ball = np.abs(np.linalg.norm(points - [0, 0, 0.6], axis=1) - 0.06)
     assert np.mean(to_ball) < 0.25 * 0.06  # the guessed back as well
@@ -108,11 +120,11 @@ def test_completed_depth_is_metric_and_keeps_the_measured_front(back):
 def test_the_plane_of_symmetry_of_a_ball_passes_through_its_centre():
     """Every plane through its centre is one of a ball's."""
     _, mask, depth = _ball()
-    outline = inflation.trace_outline(mask, 48)
+    outline = trace_outline(mask, 48)
     rays = np.concatenate([(outline.pixels - [79.5, 59.5]) / FOCAL, np.ones((*outline.inside.shape, 1))], -1)
-    near = inflation.look_up(np.where(mask, depth, 0.6).astype(np.float32), outline.pixels)
+    near = look_up(np.where(mask, depth, 0.6).astype(np.float32), outline.pixels)
     thickness = np.where(outline.inside, 0.08, 0.0)
-    plane = inflation.find_plane(
+    plane = find_plane(
         rays * near[..., None], outline, mask, depth, (np.full(2, FOCAL), np.array([79.5, 59.5])), thickness
     )
     assert plane.violation < 0.1
@@ -122,22 +134,22 @@ def test_the_plane_of_symmetry_of_a_ball_passes_through_its_centre():
 def test_bad_depth_is_refused_in_words():
     rgb, mask, depth = _ball()
     with pytest.raises(ValueError, match="0% of the object has depth"):
-        inflation.complete_depth(rgb, mask, np.zeros_like(depth), CAMERA)
+        complete_depth(rgb, mask, np.zeros_like(depth), CAMERA)
     jaxtyping.config.update("jaxtyping_disable", True)  # it would speak before us
     try:
         with pytest.raises(ValueError, match="differ in size"):
-            inflation.complete_depth(rgb, mask, depth[:50], CAMERA)
+            complete_depth(rgb, mask, depth[:50], CAMERA)
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
     with pytest.raises(ValueError, match="not 'guess'"):
-        inflation.complete_depth(rgb, mask, depth, CAMERA, back="guess")
+        complete_depth(rgb, mask, depth, CAMERA, back="guess")
     found = find_foreground(Photo(rgb), mask=mask)
     with pytest.raises(ValueError, match="give the camera too"):
-        reconstruction.reconstruct(found, depth=depth)
+        reconstruct(found, depth=depth)
     with pytest.raises(ValueError, match="needs its weights"):
-        reconstruction.reconstruct(found, method="triposr")
-    assert reconstruction.reconstruct(found, depth=depth, camera=CAMERA).metric
-    assert not reconstruction.reconstruct(found).metric
+        reconstruct(found, method="triposr")
+    assert reconstruct(found, depth=depth, camera=CAMERA).metric
+    assert not reconstruct(found).metric
 
 
 def test_a_real_crop_comes_out_closed_and_of_its_size(shared):
@@ -152,7 +164,7 @@ def test_a_real_crop_comes_out_closed_and_of_its_size(shared):
     depth = cv2.imread(str(folder / "depth" / "000002.png"), -1) * camera["depth_scale"] * 1e-3
     K = np.reshape(camera["cam_K"], (3, 3))
     lens = Camera.from_matrix(K)
-    made = inflation.complete_depth(rgb, mask, depth, lens)
+    made = complete_depth(rgb, mask, depth, lens)
     assert _solid(made.mesh).is_watertight
     longest = np.linalg.norm(np.ptp(made.mesh.vertices, axis=0))
     assert 0.15 < longest < 0.27  # its diameter is 0.197 m
@@ -170,7 +182,7 @@ def test_surface_is_the_official_one_and_turned_outwards():
     ball = np.sqrt((x - 0.25) ** 2 + (y + 0.2) ** 2 + (z - 0.1) ** 2) - 0.3
     ring = np.hypot(np.hypot(x + 0.35, y - 0.25) - 0.3, z + 0.2) - 0.11
     density = 25 * np.exp(-8 * np.minimum(ball, ring))
-    vertices, faces = reconstruction.find_surface(density.astype(np.float32), 25.0, 0.87)
+    vertices, faces = find_surface(density.astype(np.float32), 25.0, 0.87)
     with np.load(GOLDEN / "triposr_surface.npz") as golden:
         official = unpack(golden["vertices_u16"])
         assert len(faces) == golden["faces"]
@@ -182,7 +194,7 @@ def test_surface_is_the_official_one_and_turned_outwards():
     assert solid.is_watertight
     assert solid.volume == pytest.approx(0.18316, abs=2e-4)
     with pytest.raises(ValueError, match="has no surface"):
-        reconstruction.find_surface(np.zeros((8, 8, 8), np.float32), 25.0, 0.87)
+        find_surface(np.zeros((8, 8, 8), np.float32), 25.0, 0.87)
 
 
 def test_mesh_of_the_tiny_model_is_the_official_one():
@@ -191,7 +203,7 @@ def test_mesh_of_the_tiny_model_is_the_official_one():
 
     golden, stages = _golden(), []
     codes = jnp.asarray(golden["scene_codes"][0])
-    mesh = reconstruction.extract_mesh(
+    mesh = extract_mesh(
         _model(), codes, resolution=32, slabs=12, chunk=2048, progress=lambda stage, share: stages.append(stage)
     )
     official = unpack(golden["mesh0/vertices_u16"])
@@ -211,7 +223,7 @@ def test_photo_to_mesh_with_a_tiny_model_stands_where_the_photo_stands():
 
     rgb, mask, _ = _ball()
     found = find_foreground(Photo(rgb), mask=mask)
-    made = reconstruction.reconstruct(found, model=_model(), resolution=32)
+    made = reconstruct(found, model=_model(), resolution=32)
     assert not made.metric and any("TripoSR made the mesh" in line for line in made.report)
     pixels, points = _project(made, np.array([[0.0, 0, 0], [TINY.radius, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]))
     np.testing.assert_allclose(pixels[0], [79, 59], atol=1.5)  # the middle of the object
@@ -226,23 +238,23 @@ def test_weights_are_refused_unless_they_are_the_published_ones(tmp_path, monkey
     with pytest.raises(
         WeightsError, match=r"not here: download https://huggingface\.co/stabilityai/TripoSR/resolve/5b52"
     ):
-        reconstruction.resolve_triposr(offline=True, download=True)
+        resolve_triposr(offline=True, download=True)
     with pytest.raises(WeightsError, match="no weights file at"):
-        reconstruction.resolve_triposr(tmp_path / "none.ckpt")
-    cached = tmp_path / "weights" / reconstruction.TRIPOSR.file
+        resolve_triposr(tmp_path / "none.ckpt")
+    cached = tmp_path / "weights" / TRIPOSR.file
     cached.parent.mkdir()
     cached.write_bytes(b"something else")
     with pytest.raises(WeightsError, match="is not the published file"):
-        reconstruction.resolve_triposr()
-    assert not reconstruction.resolve_triposr(cached).pinned
+        resolve_triposr()
+    assert not resolve_triposr(cached).pinned
     with pytest.raises(WeightsError):
-        reconstruction.load_triposr(cached)
+        load_triposr(cached)
 
 
 def test_random_weights_of_any_size_make_a_model():
     from test_triposr import TINY
 
-    model = triposr.TripoSR(dataclasses.replace(TINY, dtype="bfloat16"), rngs=nnx.Rngs(0))
+    model = TripoSR(dataclasses.replace(TINY, dtype="bfloat16"), rngs=nnx.Rngs(0))
     count = sum(leaf.get_value().size for _, leaf in nnx.to_flat_state(nnx.state(model, nnx.Param)))
     pooler = 24 * 24 + 24
-    assert count == sum(int(np.prod(shape)) for shape in triposr.official_shapes(TINY).values()) - pooler
+    assert count == sum(int(np.prod(shape)) for shape in official_shapes(TINY).values()) - pooler

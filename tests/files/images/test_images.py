@@ -16,7 +16,7 @@ from ipjax.files.images.masks import as_mask, read_mask
 from ipjax.files.images.opening import read_rgb
 from ipjax.inference.frames import frame
 from ipjax.onboarding.foreground import read_photo
-from ipjax.onboarding.photo import take_shot
+from ipjax.onboarding.photo import prepare_photo
 
 HEIGHT, WIDTH = 96, 128
 K = np.array([[110.0, 0, 63.2], [0, 108.0, 47.4], [0, 0, 1]])
@@ -300,7 +300,7 @@ def test_images_that_are_to_be_turned_are_refused_where_others_belong_to_them(tm
     plain = store(mask, tmp_path / "plain.png")
     for beside in ({"mask": plain}, {"mask": mask}, {"box": (30, 20, 60, 60), "camera": K}):
         with pytest.raises(ValueError, match=rf"EXIF orientation \({turn}\)"):
-            take_shot(tmp_path / "rgb.png", **beside)
+            prepare_photo(tmp_path / "rgb.png", **beside)
 
 
 def test_images_that_are_upright_say_so_or_nothing(tmp_path):

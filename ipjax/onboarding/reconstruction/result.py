@@ -1,17 +1,21 @@
 """What every way from a photo to a mesh returns."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 from ipjax.files.meshes.mesh import Mesh
 from ipjax.records import Camera, Similarity
+
+Progress = Callable[[str, float], Any]  # stage, share done
 
 
 @dataclasses.dataclass(frozen=True)
 class Reconstruction:
     """A mesh made from one photo, and where the photo's camera stood.
 
-    ``camera_from_mesh`` maps the mesh as it is here; a mesh that is normalised later tells this frame by
-    `Mesh.to_file`. With ``camera`` it puts the mesh onto the photo, pixel by pixel.
+    ``camera_from_mesh`` maps the mesh as it is here; a mesh that is normalised later keeps the
+    way back to this frame in `Mesh.to_file`. With ``camera`` it puts the mesh onto the photo, pixel by pixel.
     """
 
     mesh: Mesh

@@ -1,8 +1,7 @@
-"""From one photo to a mesh, and where the photo's camera stood: by TripoSR, or without learned weights."""
+"""TripoSR's part: its weights, its mesh of a photo, and the surface of its density field."""
 
 import dataclasses
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from ipjax.files.weights.downloading import download_file
 from ipjax.files.weights.finding import is_offline
 from ipjax.files.weights.found import Resolved
 from ipjax.files.weights.hashes import recall_hash
-from ipjax.onboarding.reconstructed import Reconstruction
+from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
 from ipjax.records import Camera, Similarity
 
 if TYPE_CHECKING:
@@ -33,52 +32,6 @@ TRIPOSR = Source(
     url="https://huggingface.co/stabilityai/TripoSR/resolve/5b521936b01fbe1890f6f9baed0254ab6351c04a/model.ckpt",
 )
 _DISTANCE, _FOV = 1.9, 40.0  # of the camera that the model's renderer puts before the object: mesh units, degrees
-Progress = Callable[[str, float], Any]  # stage, share done
-
-
-def reconstruct(
-    foreground: "Foreground",
-    *,
-    method: str = "auto",
-    depth: Float[np.ndarray, "h w"] | None = None,
-    camera: Camera | None = None,
-    model: "TripoSR | None" = None,
-    resolution: int = 256,
-    progress: Progress | None = None,
-) -> Reconstruction:
-    """A mesh of the object in a photo.
-
-    Args:
-        method: "triposr" (needs ``model``), "inflate" (no weights), or "auto": the measured surface where there is
-            depth, else TripoSR where there is a model, else inflation.
-        depth: along z, metres, 0 = unknown, as large as the photo; needs ``camera``. Used without weights only.
-        camera: of the photo; None = unknown.
-        resolution: of the grid in which TripoSR's surface is found.
-
-    Raises ValueError in words: unknown method, depth without camera, TripoSR without its weights, unusable depth.
-    """
-    from ipjax.onboarding.inflation import complete_depth, inflate_photo
-
-    if method not in ("auto", "triposr", "inflate"):
-        raise ValueError(f"the method is 'auto', 'triposr' or 'inflate', not {method!r}")
-    if depth is not None and camera is None:
-        raise ValueError("depth without its camera has no metric points: give the camera too")
-    if method == "auto":
-        method = "triposr" if depth is None and model is not None else "inflate"
-    notes = foreground.notes
-    if method == "triposr":
-        if model is None:
-            raise ValueError("TripoSR needs its weights: `load_triposr` finds them, method 'inflate' needs none")
-        made = reconstruct_with_triposr(model, foreground, resolution=resolution, progress=progress)
-    elif depth is not None:
-        assert camera is not None
-        made = complete_depth(foreground.rgb, foreground.mask, depth, camera)
-    else:
-        made = inflate_photo(foreground.rgb, foreground.mask, camera=camera)
-    return dataclasses.replace(made, report=notes + made.report)
-
-
-# --- TripoSR ----------------------------------------------------------------------------------------------------------
 
 
 def resolve_triposr(
@@ -143,15 +96,15 @@ def reconstruct_with_triposr(
     from ipjax.networks.triposr.model import prepare_image
     from ipjax.onboarding.foreground import composite_grey, crop_foreground
 
-    tell = progress or (lambda stage, share: None)
+    show = progress or (lambda stage, share: None)
     rgba = np.dstack([foreground.rgb, foreground.alpha])
     square, (x, y) = crop_foreground(rgba)
     photo = jnp.asarray(composite_grey(square).astype(np.float32) / 255)
-    tell("network", 0.0)
+    show("network", 0.0)
     triplane = nnx.jit(lambda model, image: model(image))(model, prepare_image(photo, model.config.image_size))
     triplane.block_until_ready()
-    tell("network", 1.0)
-    mesh = extract_mesh(model, triplane, resolution=resolution, progress=tell)
+    show("network", 1.0)
+    mesh = extract_mesh(model, triplane, resolution=resolution, progress=show)
     size = square.shape[0]
     focal = 0.5 * size / np.tan(np.deg2rad(0.5 * _FOV))
     camera = Camera(
@@ -164,7 +117,7 @@ def reconstruct_with_triposr(
         translation=jnp.asarray([0, 0, _DISTANCE], jnp.float32),
         scale=jnp.float32(1.0),
     )
-    seen = _facing(mesh, np.array([_DISTANCE, 0.0, 0.0]))
+    seen = _find_seen(mesh, np.array([_DISTANCE, 0.0, 0.0]))
     report = (
         f"TripoSR made the mesh ({len(mesh.faces):,} faces, resolution {resolution}); its scale is arbitrary",
         "the photo's camera is the one TripoSR assumes (40° field of view, level, 1.9 units away)",
@@ -172,7 +125,7 @@ def reconstruct_with_triposr(
     return Reconstruction(dataclasses.replace(mesh, seen=seen), pose, camera, False, report)
 
 
-def _facing(mesh: Mesh, eye: np.ndarray) -> np.ndarray:
+def _find_seen(mesh: Mesh, eye: np.ndarray) -> np.ndarray:
     """1 for vertices that face the eye and that nothing hides (depth buffer of the vertices, 96² bins), else 0."""
     towards = eye - mesh.vertices
     distance = np.linalg.norm(towards, axis=1)
@@ -206,7 +159,7 @@ def extract_mesh(
 
     from ipjax.networks.triposr.field import density_grid, query
 
-    tell = progress or (lambda stage, share: None)
+    show = progress or (lambda stage, share: None)
     # The window slides back at the end rather than change its size: one shape, one compilation.
     slabs = min(slabs, resolution)
     grid = np.empty((resolution,) * 3, np.float32)
@@ -214,14 +167,14 @@ def extract_mesh(
     for start in range(0, resolution, slabs):
         start = min(start, resolution - slabs)
         grid[start : start + slabs] = run(model, triplane, jnp.int32(start))
-        tell("density", (start + slabs) / resolution)
+        show("density", (start + slabs) / resolution)
     vertices, faces = find_surface(grid, model.config.threshold, model.config.radius)
     count = -(-len(vertices) // chunk) * chunk  # whole chunks: one compilation per count of chunks
     padded = np.zeros((count, 3), np.float32)
     padded[: len(vertices)] = vertices
     paint = nnx.jit(lambda model, triplane, points: query(model, triplane, points, chunk=chunk)[1])
     colours = np.concatenate([paint(model, triplane, jnp.asarray(part)) for part in padded.reshape(-1, chunk, 3)])
-    tell("colour", 1.0)
+    show("colour", 1.0)
     return make_mesh(vertices, faces, colours=np.rint(255 * colours[: len(vertices)]).astype(np.uint8))
 
 
