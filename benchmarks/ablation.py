@@ -10,7 +10,9 @@ import json
 import sys
 from pathlib import Path
 
-from benchmarks import evaluation, results_page
+from benchmarks import evaluation
+from benchmarks.results_page.runs import Study, read_studies
+from benchmarks.results_page.tables import markdown_table, median_cells, percent
 from ipjax.files.storage.writing import write_text
 
 BY_DEPTH = {"ranking": "render", "power": 0.0, "alternates": 0, "drawn": 0}  # candidates compared by depth alone
@@ -52,12 +54,12 @@ def main(arguments: list[str] | None = None) -> None:
         write_text(files[-1], json.dumps(changes, indent=1) + "\n", parents=True)
     page = [] if "--page" in arguments else ["--page", str(folder / "page")]
     evaluation.main([*arguments, "-o", str(folder), *page, "--methods", *map(str, files)])
-    text = table(results_page.read_studies(folder / "studies.json"))
+    text = table(read_studies(folder / "studies.json"))
     write_text(folder / "table.md", text, parents=True)
     print(text)
 
 
-def table(studies: list[results_page.Study]) -> str:
+def table(studies: list[Study]) -> str:
     """Two tables, a row for each step and a column for each study: AR of all frames with its interval, and medians."""
     shares = [["AR, %", *(s.title for s in studies)]]
     medians = [["medians: rotation ° / translation mm / scale %", *shares[0][1:]]]
@@ -65,9 +67,9 @@ def table(studies: list[results_page.Study]) -> str:
         step = run["method"].removeprefix("ipjax-").replace("_", " ")
         all_of = [study.runs[index] for study in studies]
         frames = [run["all_frames"] for run in all_of]
-        shares.append([step, *(results_page.percent(f["recalls"].get("ar"), f["intervals"].get("ar")) for f in frames)])
-        medians.append([step, *(" / ".join(results_page.median_cells(run)) for run in all_of)])
-    return "\n".join([*results_page.markdown_table(shares), "", *results_page.markdown_table(medians)]) + "\n"
+        shares.append([step, *(percent(f["recalls"].get("ar"), f["intervals"].get("ar")) for f in frames)])
+        medians.append([step, *(" / ".join(median_cells(run)) for run in all_of)])
+    return "\n".join([*markdown_table(shares), "", *markdown_table(medians)]) + "\n"
 
 
 if __name__ == "__main__":

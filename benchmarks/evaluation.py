@@ -13,8 +13,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks import results_page
 from benchmarks.classical import Classical, import_open3d, read_bodies
+from benchmarks.results_page.page import write_page
+from benchmarks.results_page.runs import read_studies
 from ipjax.bop import run as studies
 from ipjax.bop.dataset import Dataset, DatasetError
 from ipjax.bop.evaluation import Score, evaluate
@@ -211,7 +212,7 @@ def main(arguments: list[str] | None = None) -> None:
         write_text(options.output / "studies.json", json.dumps(manifest, indent=1), parents=True)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    results_page.write(results_page.read_studies(options.output / "studies.json"), options.page)
+    write_page(read_studies(options.output / "studies.json"), options.page)
     print(f"{time.perf_counter() - start:.0f} s in all")
 
 

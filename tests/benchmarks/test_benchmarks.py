@@ -13,7 +13,7 @@ import pytest
 from benchmarks import ablation, calibration, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from benchmarks.photo_pairs import camera_from_true_mesh
-from benchmarks.results_page import Study
+from benchmarks.results_page.runs import Study
 from ipjax.config import ConfidenceConfig, Config
 from ipjax.estimation.confidence import probability
 from ipjax.files.settings import describe_config, read_config

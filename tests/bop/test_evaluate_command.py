@@ -133,7 +133,8 @@ def test_one_command_runs_all_and_makes_the_page(place, whole):
 
 
 def test_the_page_shows_the_model_where_the_estimate_is(place, whole):
-    from benchmarks.results_page import Study, cut, draw_models, read_run, square_around
+    from benchmarks.results_page.pictures import cut, draw_models, square_around
+    from benchmarks.results_page.runs import Study, read_run
 
     run = read_run(place / "whole")
     study = Study("balls", place / "balls", None, [run])
