@@ -10,8 +10,8 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from builders.layers import FIRST_COMMAND, FIRST_IMPURE, MODULES, layer_of
 from jaxtyping import Array, Float
-from test_layers import FIRST_COMMAND, FIRST_IMPURE, MODULES, layer_of
 
 import ipjax
 

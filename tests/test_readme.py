@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-import test_pipeline
+from builders import tiny_pipeline
 
 import ipjax
 from ipjax.files.meshes.saving import save_mesh
@@ -70,17 +70,17 @@ def test_quickstart_runs(tmp_path, monkeypatch):
 def test_many_at_once_runs(monkeypatch):
     """Word for word: two objects of different sizes, a query of each, and their diameters. With the tests' encoder."""
     _, code = find_blocks("python")
-    monkeypatch.setattr(ipjax, "Config", lambda: test_pipeline.DRAWN)
+    monkeypatch.setattr(ipjax, "Config", lambda: tiny_pipeline.DRAWN)
     names = {"ipjax": ipjax, "encoder": problems.make_encoder()}
-    names["mug"], names["tin"] = test_pipeline.two_objects()
+    names["mug"], names["tin"] = tiny_pipeline.two_objects()
     diameters = 0.12, 0.09  # as the text says
-    names["first"], first = test_pipeline.make_sized_query(0, diameters[0])
-    names["second"], second = test_pipeline.make_sized_query(1, diameters[1])
+    names["first"], first = tiny_pipeline.make_sized_query(0, diameters[0])
+    names["second"], second = tiny_pipeline.make_sized_query(1, diameters[1])
     exec(compile(code, str(README), "exec"), names)
     poses = names["found"].camera_from_object
     for index, truth in enumerate((first, second)):
         pose = jax.tree.map(lambda x, index=index: x[index], poses)
-        test_pipeline.assert_near(pose, truth, 0.05, 1e-6, 15)
+        tiny_pipeline.assert_near(pose, truth, 0.05, 1e-6, 15)
 
 
 def test_quickstart_is_ten_lines():

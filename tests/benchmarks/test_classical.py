@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bop_roots import ERRORS, write_models
+from builders.bop_roots import ERRORS, write_models
 
 from benchmarks import classical
 from ipjax.bop.dataset import MM, Frame

@@ -6,7 +6,7 @@ from pathlib import Path
 import hypothesis.extra.numpy as hnp
 import numpy as np
 import pytest
-from bop_roots import write_images
+from builders.bop_roots import write_images
 from hypothesis import given
 from PIL import Image
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bop_roots import write_ellipsoids
+from builders.bop_roots import write_ellipsoids
 
 HERE = Path(__file__).resolve().parents[1]
 VIEWS = ["--directions", "6", "--rolls", "4"]
@@ -26,7 +26,7 @@ def start(*words, pause: float = 0.0) -> subprocess.Popen:
     roots = [str(HERE.parent), str(HERE.parent / "kernels"), *sys.path]
     environment["PYTHONPATH"] = os.pathsep.join(p for p in roots if p)
     return subprocess.Popen(
-        [sys.executable, str(HERE / "stand_in.py"), str(pause), *map(str, words)],
+        [sys.executable, str(HERE / "builders" / "stand_in.py"), str(pause), *map(str, words)],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bop_roots import ERRORS, PROTOCOL, write_images, write_protocol
+from builders.bop_roots import ERRORS, PROTOCOL, write_images, write_protocol
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

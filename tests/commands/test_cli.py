@@ -12,8 +12,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.estimates import make_estimate
 from builders.objects import make_object, nan, rewrite
-from estimates import make_estimate
 from PIL import Image
 
 from ipjax import cli

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.tiny_pipeline import TINY, estimate
 from hypothesis import given
 from hypothesis import strategies as st
 from ipjax_kernels.positive import invert_semidefinite, root
-from test_pipeline import TINY, estimate
 
 import ipjax
 from ipjax.config import RefineConfig

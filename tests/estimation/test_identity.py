@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import pytest
+from builders.tiny_pipeline import TINY
 from flax import nnx
-from test_pipeline import TINY
 
 import ipjax
 from ipjax.estimation.features import identity_of

@@ -7,33 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.tiny_pipeline import DRAWN, TINY, TRACES, TURNED, estimate, make_sized_query, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ipjax
 from benchmarks.bias import pose_errors, summary
-from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
+from ipjax.config import Config, MatchConfig, ScoreConfig
 from ipjax.estimation.features import cut, principal_basis
 from ipjax.estimation.pipeline import comparable, distinct
 from ipjax.records import Query, Similarity
 from ipjax.synthetic import problems
-
-TINY = Config(
-    match=MatchConfig(views=2, pairs=64),
-    align=AlignConfig(count=128),
-    refine=RefineConfig(steps=4, points=96),
-    score=ScoreConfig(resolution=28, alternates=0),
-)
-TURNED = dataclasses.replace(TINY, score=ScoreConfig(resolution=28, alternates=1))
-DRAWN = dataclasses.replace(TINY, score=ScoreConfig(resolution=28, alternates=0, drawn=2))
-TRACES = []
-
-
-@jax.jit
-def estimate(templates, query, key, config, diameter=None):
-    """Compiled once for each of the configurations above, not once per test."""
-    TRACES.append(config)
-    return ipjax.estimate(None, templates, query, key, config, diameter)
 
 
 @pytest.fixture(scope="module")
@@ -271,27 +255,6 @@ def test_compacted_templates_give_the_same_answer(templates):
         query, _ = problems.make_query(seed)
         whole, found = (estimate(one, query, jax.random.key(seed), TINY) for one in (templates, small))
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-4, rtol=1e-3), whole, found)
-
-
-def two_objects():
-    """The ellipsoid onboarded twice: more and fewer views, patches, and points of surface and appearance."""
-    large = dataclasses.replace(problems.make_templates(), appearance=problems.make_appearance(20_000))
-    few = jax.tree.map(lambda x: x[:6], (VIEWS(large)))
-    small = eqx.tree_at(VIEWS, large, few)
-    small = dataclasses.replace(small, surface=problems.make_surface(300), appearance=problems.make_appearance(14_000))
-    return large, ipjax.compact(small, multiple=8)
-
-
-VIEWS = lambda t: (t.patches, t.norm, t.seen, t.camera_from_object, t.camera)
-
-
-def make_sized_query(seed: int, diameter: float):
-    """As `problems.make_query`, of an object of that diameter, farther or nearer in proportion."""
-    query, truth = problems.make_query(seed)
-    factor = jnp.asarray(diameter, jnp.float32) / truth.scale
-    sized = lambda q: (q.patches.points, q.view.depth)
-    query = eqx.tree_at(sized, query, jax.tree.map(lambda x: x * factor, sized(query)))
-    return query, Similarity(truth.rotation, truth.translation * factor, truth.scale * factor)
 
 
 def test_vmap_over_padded_objects_queries_and_diameters_equals_the_loop():

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.objects import make_object
+from builders.tiny_pipeline import DRAWN, make_sized_query, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.numpy import save_file
-from test_pipeline import DRAWN, make_sized_query, two_objects
 
 import ipjax
 from ipjax.config import MatchConfig

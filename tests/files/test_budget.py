@@ -10,8 +10,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import own_memory
 import pytest
+from builders import own_memory
 from builders.objects import make_object
 from builders.weight_files import Program, field, onnx_tensor, state_dict, write_pth
 

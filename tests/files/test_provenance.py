@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders.layers import MODULES
 from builders.objects import make_object
 from PIL import Image
-from test_layers import MODULES
 
 from ipjax.bop import run as studies
 from ipjax.config import OnboardConfig

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
-from estimates import make_estimate
+from builders.estimates import make_estimate
 from PIL import Image
 
 from ipjax.files.objects.record import ObjectInfo

@@ -5,7 +5,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from estimates import make_estimate
+from builders.estimates import make_estimate
 
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.batching import compact

@@ -9,7 +9,7 @@ from importlib.metadata import version
 import jax
 import numpy as np
 import pytest
-from test_pipeline import TINY
+from builders.tiny_pipeline import TINY
 
 import ipjax
 from ipjax.inference.exporting import blank_query, export, to_dictionary

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from builders.tiny_dinov2 import VARIANTS, tiny
 from flax import nnx
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,18 +20,8 @@ from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, encode, tokens
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 TOLERANCE = 2e-5
-VARIANTS = {
-    "plain": {},
-    "registers": {"registers": 4, "antialias": True, "offset": 0.0},
-    "swiglu": {"swiglu": True, "hidden": 128},
-}
 SIZES = ("native70x70", "square98x98", "wide42x112")
 GRIDS = ("16x16", "30x30", "32x32", "46x46", "60x60", "28x37", "37x28", "74x74")
-
-
-def tiny(variant: str, depth: int = 3, **others) -> DinoV2Config:
-    shape = {"width": 48, "depth": depth, "heads": 3, "hidden": 192, "grid": 5, **VARIANTS[variant], **others}
-    return DinoV2Config(**shape)
 
 
 @cache

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.tiny_triposr import TINY, make_model, read_golden, read_weights
 from conftest import GOLDEN
 from flax import nnx
 from golden.make_triposr import cut
@@ -15,53 +16,24 @@ from golden.make_triposr import cut
 from ipjax.networks.dinov2 import normalise
 from ipjax.networks.triposr.config import TripoSRConfig, VisionConfig
 from ipjax.networks.triposr.field import density_grid, query, sample_planes
-from ipjax.networks.triposr.model import TripoSR, prepare_image
+from ipjax.networks.triposr.model import prepare_image
 from ipjax.networks.triposr.renderer import Rays, meet_cube, orbit_rays, render
 from ipjax.networks.triposr.vision import interpolate_positions
 from ipjax.networks.triposr.weights import load_model, official_shapes
-
-TINY = TripoSRConfig(
-    vision=VisionConfig(width=24, layers=2, heads=3, hidden=96, patch=16, grid=5),
-    image_size=128,
-    plane_size=8,
-    width=32,
-    layers=2,
-    heads=2,
-    groups=8,
-    plane_channels=10,
-    decoder_width=16,
-    decoder_layers=3,
-)
-
-
-@functools.cache
-def _golden() -> dict[str, np.ndarray]:
-    """The official numbers, cut as `golden.make_triposr` says."""
-    with np.load(GOLDEN / "triposr_tiny.npz") as arrays:
-        return {name: arrays[name] for name in arrays.files}
-
-
-@functools.cache
-def _model() -> TripoSR:
-    return load_model(TINY, _weights(_golden()))
 
 
 @functools.cache
 def _photos() -> np.ndarray:
     """What the model reads: both pictures, prepared by us (`test_image_preparation_is_the_official_one`)."""
-    golden = _golden()
+    golden = read_golden()
     pictures = (golden[name].astype(np.float32) / 255 for name in ("pre/composite_u8", "in/image1_u8"))
     return np.stack([prepare_image(jnp.asarray(picture), 128) for picture in pictures])
-
-
-def _weights(golden):
-    return {name.removeprefix("w/"): array for name, array in golden.items() if name.startswith("w/")}
 
 
 @functools.cache
 def _stages() -> dict[str, np.ndarray]:
     """Every array of the golden file up to the scene codes, as our modules make it, compiled once."""
-    model = _model()
+    model = make_model()
 
     @nnx.jit
     @functools.partial(nnx.vmap, in_axes=(None, 0))
@@ -135,11 +107,11 @@ def _close(ours, theirs, relative=2e-4):
     ],
 )
 def test_stages_are_the_official_ones(name):
-    _close(cut(name, _stages()[name]), _golden()[name], 2e-5)
+    _close(cut(name, _stages()[name]), read_golden()[name], 2e-5)
 
 
 def test_image_preparation_is_the_official_one():
-    golden = _golden()
+    golden = read_golden()
     _close(cut("in/rgb_cond", _photos()), golden["in/rgb_cond"], 2e-5)
     _close(cut("pre/model_input_128", _photos()[:1]), golden["pre/model_input_128"], 2e-5)
     noise = np.repeat(golden["pre/resize_aa_in_u8"].astype(np.float32) / 255, 3, axis=2)
@@ -149,15 +121,15 @@ def test_image_preparation_is_the_official_one():
 
 
 def test_patches_are_the_official_ones():
-    golden, model = _golden(), _model()
+    golden, model = read_golden(), make_model()
     positions = interpolate_positions(model.tokenizer.positions[...], 8)
     patches = _stages()["vit/embeddings"] - np.asarray(positions)
     _close(cut("vit/patch_embeddings", patches[:, 1:]), golden["vit/patch_embeddings"])
 
 
 def test_positions_follow_the_rule_of_the_checkpoint_and_not_the_newer_one():
-    golden = _golden()
-    stored = _weights(golden)["image_tokenizer.model.embeddings.position_embeddings"][0]
+    golden = read_golden()
+    stored = read_weights(golden)["image_tokenizer.model.embeddings.position_embeddings"][0]
     for source, side, old, new in (
         (stored, 8, "vit/pos_embed_interpolated", "vit/pos_embed_interpolated_NEW_ge_4_45_for_contrast"),
         (golden["posembed14to32/in"][0], 32, "posembed14to32/out", "posembed14to32/out_NEW_ge_4_45_for_contrast"),
@@ -168,7 +140,7 @@ def test_positions_follow_the_rule_of_the_checkpoint_and_not_the_newer_one():
 
 
 def test_queries_are_the_official_ones():
-    golden, model = _golden(), _model()
+    golden, model = read_golden(), make_model()
     points = jnp.asarray(golden["query/points"])
 
     @nnx.jit
@@ -192,13 +164,13 @@ def test_queries_are_the_official_ones():
 
 @functools.cache
 def _grid():
-    codes = jnp.asarray(_golden()["scene_codes"])
+    codes = jnp.asarray(read_golden()["scene_codes"])
     run = nnx.jit(nnx.vmap(lambda model, codes: density_grid(model, codes, 32), in_axes=(None, 0)))
-    return run(_model(), codes)
+    return run(make_model(), codes)
 
 
 def test_grid_is_the_official_one():
-    golden = _golden()
+    golden = read_golden()
     np.testing.assert_allclose(cut("grid32/density_act", _grid()), golden["grid32/density_act"], rtol=2e-4)
     axis = np.linspace(-TINY.radius, TINY.radius, 32)
     first = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)[:40]
@@ -207,7 +179,7 @@ def test_grid_is_the_official_one():
 
 def test_grid_is_the_field_at_its_points_slab_by_slab():
     """The grid's shortcut (planes first, points later) against the plain query; slabs against the whole."""
-    model, codes = _model(), jnp.asarray(_golden()["scene_codes"][0])
+    model, codes = make_model(), jnp.asarray(read_golden()["scene_codes"][0])
     axis = np.linspace(-TINY.radius, TINY.radius, 32, dtype=np.float32)
     points = np.stack(np.meshgrid(axis[5:9], axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     density, _ = nnx.jit(query)(model, codes, jnp.asarray(points))
@@ -233,10 +205,10 @@ def _rays(name: str) -> Rays:
 @functools.cache
 def _renders() -> dict:
     """All views of both triplanes in one call; images x views x 16 x 16 for each orbit."""
-    codes = jnp.asarray(_golden()["scene_codes"])
+    codes = jnp.asarray(read_golden()["scene_codes"])
     rays = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *map(_rays, ORBITS))
     run = nnx.jit(nnx.vmap(lambda model, codes, rays: render(model, codes, rays, chunk=500), in_axes=(None, 0, None)))
-    seen = run(_model(), codes, rays)
+    seen = run(make_model(), codes, rays)
     cuts = np.cumsum([0, *(views for views, _ in ORBITS.values())])
     return {
         name: jax.tree.map(lambda leaf, a=a, b=b: np.asarray(leaf)[:, a:b], seen)
@@ -246,7 +218,7 @@ def _renders() -> dict:
 
 @pytest.mark.parametrize("name", ORBITS)
 def test_rays_and_renders_are_the_official_ones(name):
-    golden = _golden()
+    golden = read_golden()
     rays = _rays(name)
     _close(rays.origins, golden[f"{name}/rays_o"], 2e-6)
     _close(rays.directions, golden[f"{name}/rays_d"], 2e-6)
@@ -270,7 +242,7 @@ def test_rays_and_renders_are_the_official_ones(name):
 
 def test_distance_is_where_the_light_stops():
     """The renderer's distance and opacity against an open sum in float64 over the plain query, ray by ray."""
-    model, codes = _model(), jnp.asarray(_golden()["scene_codes"][0])
+    model, codes = make_model(), jnp.asarray(read_golden()["scene_codes"][0])
     rays, seen = _rays("render_default"), _renders()["render_default"]
     pick = [(0, 7, 7), (1, 8, 6), (2, 5, 9), (3, 10, 8)]
     near, far, _ = map(np.asarray, meet_cube(rays, TINY.radius))
@@ -330,7 +302,7 @@ def test_defaults_are_the_published_configuration():
 
 
 def test_wrong_weights_are_named():
-    weights = _weights(_golden())
+    weights = read_weights(read_golden())
     short = {name: array for name, array in weights.items() if name != "backbone.proj_in.bias"}
     with pytest.raises(ValueError, match=r"1 missing \(backbone\.proj_in\.bias\)"):
         load_model(TINY, short)
@@ -342,9 +314,9 @@ def test_wrong_weights_are_named():
 
 def test_every_weight_arrives_where_it_belongs():
     """Official arrays, each filled with a number of its own, fill exactly one of ours each, or are known as unused."""
-    names = list(_weights(_golden()))
+    names = list(read_weights(read_golden()))
     numbered = {
-        name: np.full(array.shape, i, np.float32) for i, (name, array) in enumerate(_weights(_golden()).items())
+        name: np.full(array.shape, i, np.float32) for i, (name, array) in enumerate(read_weights(read_golden()).items())
     }
     found = []
     for leaf in map(np.asarray, _leaves(load_model(TINY, numbered)).values()):
@@ -362,8 +334,8 @@ def _leaves(model):
 
 
 def test_half_precision_stays_close_and_keeps_half_the_memory():
-    golden = _golden()
-    half = load_model(dataclasses.replace(TINY, dtype="bfloat16"), _weights(golden))
+    golden = read_golden()
+    half = load_model(dataclasses.replace(TINY, dtype="bfloat16"), read_weights(golden))
     assert {leaf.dtype for path, leaf in _leaves(half).items() if path[0] != "decoder"} == {jnp.dtype("bfloat16")}
     codes = nnx.jit(lambda model, image: model(image))(half, jnp.asarray(_photos()[0]))
     assert codes.dtype == jnp.float32
@@ -373,6 +345,6 @@ def test_half_precision_stays_close_and_keeps_half_the_memory():
 
 def test_a_photo_of_another_size_is_refused():
     with pytest.raises(ValueError, match="reads 128 × 128 photos, not 64 × 64"):
-        _model()(jnp.zeros((64, 64, 3), jnp.float32))
+        make_model()(jnp.zeros((64, 64, 3), jnp.float32))
     with pytest.raises(ValueError, match="not a multiple of the patch"):
-        _model().tokenizer.embed(jnp.zeros((100, 100, 3), jnp.float32))
+        make_model().tokenizer.embed(jnp.zeros((100, 100, 3), jnp.float32))

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.objects import make_object
+from builders.tiny_dinov2 import tiny
 from flax import nnx
 from PIL import Image
-from test_dinov2 import tiny
 
 from ipjax import cli
 from ipjax.config import OnboardConfig

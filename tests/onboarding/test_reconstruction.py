@@ -7,6 +7,7 @@ import jaxtyping
 import numpy as np
 import pytest
 import trimesh
+from builders.tiny_triposr import TINY, make_model, read_golden
 from conftest import GOLDEN
 from flax import nnx
 from golden.make_triposr import unpack
@@ -199,12 +200,11 @@ def test_surface_is_the_official_one_and_turned_outwards():
 
 def test_mesh_of_the_tiny_model_is_the_official_one():
     from scipy.spatial import cKDTree
-    from test_triposr import TINY, _golden, _model
 
-    golden, stages = _golden(), []
+    golden, stages = read_golden(), []
     codes = jnp.asarray(golden["scene_codes"][0])
     mesh = extract_mesh(
-        _model(), codes, resolution=32, slabs=12, chunk=2048, progress=lambda stage, share: stages.append(stage)
+        make_model(), codes, resolution=32, slabs=12, chunk=2048, progress=lambda stage, share: stages.append(stage)
     )
     official = unpack(golden["mesh0/vertices_u16"])
     tree = cKDTree(official)
@@ -219,11 +219,9 @@ def test_mesh_of_the_tiny_model_is_the_official_one():
 
 def test_photo_to_mesh_with_a_tiny_model_stands_where_the_photo_stands():
     """Random weights: the shape means nothing; its frame, its camera and its report do."""
-    from test_triposr import TINY, _model
-
     rgb, mask, _ = _ball()
     found = find_foreground(Photo(rgb), mask=mask)
-    made = reconstruct(found, model=_model(), resolution=32)
+    made = reconstruct(found, model=make_model(), resolution=32)
     assert not made.metric and any("TripoSR made the mesh" in line for line in made.report)
     pixels, points = _project(made, np.array([[0.0, 0, 0], [TINY.radius, 0, 0], [0, 0.3, 0], [0, 0, 0.3]]))
     np.testing.assert_allclose(pixels[0], [79, 59], atol=1.5)  # the middle of the object
@@ -252,8 +250,6 @@ def test_weights_are_refused_unless_they_are_the_published_ones(tmp_path, monkey
 
 
 def test_random_weights_of_any_size_make_a_model():
-    from test_triposr import TINY
-
     model = TripoSR(dataclasses.replace(TINY, dtype="bfloat16"), rngs=nnx.Rngs(0))
     count = sum(leaf.get_value().size for _, leaf in nnx.to_flat_state(nnx.state(model, nnx.Param)))
     pooler = 24 * 24 + 24

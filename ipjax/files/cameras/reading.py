@@ -47,7 +47,7 @@ def as_intrinsics(camera: Any) -> Intrinsics:
         return read_camera(camera)
     array = as_numbers(camera, "the camera")
     if array.shape == (4,):
-        return Intrinsics(make_matrix(*array))
+        return Intrinsics(_make_matrix(*array))
     return Intrinsics(array)
 
 
@@ -79,14 +79,14 @@ def read_camera(source: str | Path | dict, image: int | None = None) -> Intrinsi
         raise ValueError(f"{path}: {error}") from None
 
 
-def make_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def _make_matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64)
 
 
-def find_matrix(array: np.ndarray) -> np.ndarray | None:
+def _find_matrix(array: np.ndarray) -> np.ndarray | None:
     """K of fx, fy, cx, cy, of nine numbers row by row, or of rows of four that move nothing; None of others."""
     if array.size == 4:
-        return make_matrix(*array.reshape(-1))
+        return _make_matrix(*array.reshape(-1))
     if array.size == 9:
         return array.reshape(3, 3)
     if array.size in (12, 16):
@@ -114,7 +114,7 @@ def _read_entry(entry: Any, image: int | None) -> Intrinsics:
         if len(entry) == 1 and isinstance(entry[0], dict):
             return _read_entry(entry[0], image)
         array = as_numbers(entry, "the camera")
-        matrix = find_matrix(array)
+        matrix = _find_matrix(array)
         if matrix is not None:
             return Intrinsics(matrix)
         raise ValueError(f"{array.size} numbers are no camera; fx fy cx cy, or nine numbers row by row, are expected")
@@ -165,7 +165,7 @@ def _read_matrix(fields: Fields) -> np.ndarray:
         if isinstance(given, dict):
             given = given.get("data", ())
         array = as_numbers(given, "the camera matrix")
-        matrix = find_matrix(array)
+        matrix = _find_matrix(array)
         if matrix is None:
             raise ValueError(f"the camera matrix has {array.size} entries instead of 9")
         if by_columns and np.array_equal(matrix[:2, 2], (0, 0)):  # Open3D writes it column by column
@@ -178,7 +178,7 @@ def _read_matrix(fields: Fields) -> np.ndarray:
     if missing and matrix is None:
         raise ValueError(f"the camera has no {', '.join(missing)}")
     if not missing:
-        other = make_matrix(*(as_number(number, "fx, fy, cx, cy") for number in numbers))
+        other = _make_matrix(*(as_number(number, "fx, fy, cx, cy") for number in numbers))
         if matrix is not None and not np.allclose(matrix, other, rtol=1e-4, atol=0.01):
             raise ValueError("the camera matrix and fx, fy, cx, cy say different things; keep what is right")
         return other

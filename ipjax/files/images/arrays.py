@@ -8,6 +8,7 @@ from ipjax.files.storage.budget import check_budget
 
 
 def load_npy(path: Path) -> np.ndarray:
+    """The array of an npy file of numbers. Raises ValueError that names the file."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:

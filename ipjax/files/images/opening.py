@@ -97,6 +97,7 @@ def get_orientation(image: Image.Image) -> int:
 
 
 def check_upright(turn: int, path: str | Path) -> None:
+    """Refuse an EXIF orientation other than upright. Raises ValueError that names the file."""
     if 2 <= turn <= 8:
         raise ValueError(
             f"{path}: its EXIF orientation ({turn}) says that it is to be shown turned, which depth, mask and camera "

@@ -165,4 +165,5 @@ def _chart_shaded(part: Part, side: int, images: dict[Texture, np.ndarray | None
 
 
 def get_colours(part: Part) -> np.ndarray:
+    """Colours of the part's vertices as bytes; plain grey where it has none."""
     return np.full((len(part.vertices), 3), GREY, np.uint8) if part.colours is None else part.colours

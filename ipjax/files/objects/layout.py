@@ -58,6 +58,7 @@ OPTIONAL_TENSORS = {
 
 
 def hash_content(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:
+    """The sha256 of a header (without its own entry) and of all tensors, in hexadecimal."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         array = tensors[name]

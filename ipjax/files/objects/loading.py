@@ -25,8 +25,8 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
     Raises:
         ValueError: missing, damaged, of another version, or made by another encoder; one sentence that names the file.
     """
-    header, tensors = read_tensors(Path(path))
-    info = make_info(header, tensors, Path(path))
+    header, tensors = _read_tensors(Path(path))
+    info = _make_info(header, tensors, Path(path))
     made_by, given = None if info.encoder in ("", UNNAMED) else info.encoder, identity_of(encoder)
     if made_by and given and made_by != given:
         raise ValueError(
@@ -93,8 +93,8 @@ def check(path: str | Path) -> list[str]:
         ValueError: as `load`, or the content is not what was written, or cannot be true.
     """
     path = Path(path)
-    header, tensors = read_tensors(path)
-    info = make_info(header, tensors, path)
+    header, tensors = _read_tensors(path)
+    info = _make_info(header, tensors, path)
     if hash_content(header, tensors) != header.get("content_sha256"):
         raise ValueError(f"{path}: damaged: the content does not have the checksum in its header")
     for name, array in tensors.items():
@@ -125,7 +125,7 @@ def check(path: str | Path) -> list[str]:
     ]
 
 
-def read_tensors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+def _read_tensors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -178,7 +178,7 @@ def _parse_header(text: str, path: Path) -> dict[str, Any]:
     return header
 
 
-def make_info(header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path) -> ObjectInfo:
+def _make_info(header: dict[str, Any], tensors: dict[str, np.ndarray], path: Path) -> ObjectInfo:
     try:
         mesh = header["mesh"]
         scale, centre = float(mesh["scale"]), [float(x) for x in mesh["centre"]]

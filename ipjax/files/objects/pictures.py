@@ -25,6 +25,7 @@ def decode_picture(picture: bytes) -> np.ndarray | None:
 
 
 def compress_pictures(pictures: Any) -> list[bytes]:
+    """Template images uint8 ``[views, height, width, 3]`` as JPEGs of at most PICTURE_SIDE; JPEGs stay."""
     if not isinstance(pictures, np.ndarray):
         return [bytes(picture) for picture in pictures]
     import cv2

@@ -105,6 +105,7 @@ def find_path(name: str | None = None) -> Path:
 
 
 def locate(path_or_name: str | Path | None, *, download: bool) -> Resolved:
+    """The weights under a path or a name of the catalogue; of None, the best that is here. Raises WeightsError."""
     if path_or_name is None or path_or_name in CATALOGUE:
         return resolve(None if path_or_name is None else str(path_or_name), download=download)
     if isinstance(path_or_name, str) and not Path(path_or_name).expanduser().exists():

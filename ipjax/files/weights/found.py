@@ -29,6 +29,7 @@ class Resolved:
 
 
 def name_recorded(path: Path) -> Path:
+    """The file beside some weights that holds the checksum of their first download."""
     return path.with_name(path.name + ".sha256")
 
 
@@ -61,6 +62,7 @@ def find_installed(source: Source) -> Path | None:
 
 
 def find_cached(source: Source) -> Resolved | None:
+    """The file in the cache, compared with what was published; None where there is none."""
     cached = cache_folder("weights") / source.file
     return check_published(cached, source, "cache") if cached.is_file() else None
 

@@ -11,8 +11,8 @@ import sys
 import zlib
 
 import numpy as np
-import own_memory
 import pytest
+from builders import own_memory
 from PIL import Image
 
 CHILD = """

@@ -14,6 +14,7 @@ from ipjax.files.meshes.textures import sample_texture
 SIDES = np.array([[220, 40, 40], [40, 200, 60], [40, 70, 220], [230, 210, 40], [200, 60, 210], [60, 200, 210]])
 HALF = np.array([1.0, 1.5, 2.0])
 WIDTH, HEIGHT = 48, 32  # of the texture: three by two fields
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # of UTF-8
 
 
 def corners() -> tuple[np.ndarray, np.ndarray]:

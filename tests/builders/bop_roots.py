@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-GOLDEN = Path(__file__).resolve().parent / "golden"
+GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 ERRORS = np.load(GOLDEN / "bop_pose_errors.npz")
 PROTOCOL = np.load(GOLDEN / "bop_protocol.npz")
 

@@ -6,9 +6,9 @@ import sys
 import zlib
 
 import numpy as np
-import own_memory
 import pytest
-from mesh_files import FACES, UV, VERTICES, Gltf, encode, pack_glb, write_obj
+from builders import own_memory
+from builders.mesh_files import FACES, UV, VERTICES, Gltf, encode, pack_glb, write_obj
 from PIL import Image
 
 LIMIT = 1_000_000_000  # bytes of memory, the interpreter and its packages with them
