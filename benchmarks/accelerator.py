@@ -426,12 +426,14 @@ def main() -> None:
     parser.add_argument("--only", choices=PARTS, action="append", help="measure this part; may be repeated")
     parser.add_argument("--page", type=Path, metavar="FILE", help="write a page of Markdown here")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the results here")
-    parser.add_argument("--answers", type=Path, metavar="FILE", help="write answers here, or compare with those in it")
+    parser.add_argument("--answers", type=Path, metavar="FILE", help="npz: write answers here, or compare with those")
     parser.add_argument("--weights", help="of the encoder (default: random ones)")
     parser.add_argument("--trace", type=Path, metavar="FOLDER", help="write a profile of two estimates here")
     parser.add_argument("--commit", help="what to call the code where there is no git (default: ask git)")
     parser.add_argument("--quick", action="store_true", help="small sizes, few runs: does it work?")
     options = parser.parse_args()
+    if options.answers and options.answers.suffix != ".npz":
+        parser.error(f"{options.answers}: answers are an npz file")
     begin = time.perf_counter()
     only = "".join(f" --only {part}" for part in options.only or [])
     results: dict[str, Any] = {**describe_device(), "date": time.strftime("%Y-%m-%d"), "quick": options.quick}

@@ -835,7 +835,7 @@ examples:
 
 
 def _weights_list(arguments: argparse.Namespace) -> None:
-    from ipjax.files.weights.found import list_weights
+    from ipjax.files.weights.local import list_weights
 
     for row in list_weights():
         print(f"{row.name:12} {row.preset:12} {row.path or '-'} ({row.origin}; {row.licence})")

@@ -93,7 +93,7 @@ def _backends() -> Iterator[Line]:
 
 
 def _weights() -> Iterator[Line]:
-    from ipjax.files.weights.found import list_weights
+    from ipjax.files.weights.local import list_weights
 
     found = [row for row in list_weights() if row.path is not None]
     for row in found:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ipjax.files.weights import catalogue, encoder, finding, found
+from ipjax.files.weights import catalogue, encoder, finding, local
 from ipjax.files.weights.catalogue import Source
 
 
@@ -72,6 +72,6 @@ def source_of(server: Server, sha256: str | None = "right") -> Source:
 
 def replace_catalogue(monkeypatch, entries: dict[str, Source]) -> dict[str, Source]:
     """For one test these are the known files."""
-    for module in (catalogue, encoder, finding, found):
+    for module in (catalogue, encoder, finding, local):
         monkeypatch.setattr(module, "CATALOGUE", entries)
     return entries

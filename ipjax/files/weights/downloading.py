@@ -18,8 +18,8 @@ from ipjax.files.storage.cache import cache_folder
 from ipjax.files.storage.locks import locked
 from ipjax.files.storage.writing import publish, write_text
 from ipjax.files.weights.catalogue import Source, WeightsError
-from ipjax.files.weights.found import Resolved, check_published, find_cached, name_recorded
 from ipjax.files.weights.hashes import hash_file
+from ipjax.files.weights.local import Resolved, check_published, find_cached, name_recorded
 from ipjax.progress import bar
 
 _log = logging.getLogger("ipjax.weights")

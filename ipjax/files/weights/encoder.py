@@ -5,8 +5,8 @@ from pathlib import Path
 
 from ipjax.files.weights.catalogue import CATALOGUE, WeightsError
 from ipjax.files.weights.finding import locate
-from ipjax.files.weights.found import Resolved
 from ipjax.files.weights.hashes import hash_file
+from ipjax.files.weights.local import Resolved
 from ipjax.files.weights.parameters import build_model, guess_preset
 from ipjax.files.weights.reading import read_weights
 from ipjax.networks.dinov2 import PRESETS, Encoder, find_preset

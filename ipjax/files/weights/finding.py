@@ -12,8 +12,8 @@ from pathlib import Path
 
 from ipjax.files.weights.catalogue import CATALOGUE, PREFERRED, WeightsError, find_source
 from ipjax.files.weights.downloading import download_file, fetch_package
-from ipjax.files.weights.found import Resolved, check_published, find_cached, find_installed, list_weights
 from ipjax.files.weights.hashes import recall_hash
+from ipjax.files.weights.local import Resolved, check_published, find_cached, find_installed, list_weights
 
 _log = logging.getLogger("ipjax.weights")
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.files.weights.finding import find_by_hash
-from ipjax.files.weights.found import list_weights
+from ipjax.files.weights.local import list_weights
 
 
 def load_matching_encoder(

@@ -13,8 +13,8 @@ from ipjax.files.storage.cache import cache_folder
 from ipjax.files.weights.catalogue import Source, WeightsError
 from ipjax.files.weights.downloading import download_file
 from ipjax.files.weights.finding import is_offline
-from ipjax.files.weights.found import Resolved
 from ipjax.files.weights.hashes import recall_hash
+from ipjax.files.weights.local import Resolved
 from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
 from ipjax.records import Camera, Similarity
 

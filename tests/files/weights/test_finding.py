@@ -10,11 +10,10 @@ from builders.weight_files import TINY, random_tensors
 from builders.weight_server import replace_catalogue
 from safetensors.numpy import save_file
 
-from ipjax.files.weights import finding
-from ipjax.files.weights import found as found_module
+from ipjax.files.weights import finding, local
 from ipjax.files.weights.catalogue import Source, WeightsError
 from ipjax.files.weights.finding import fetch, find_path, resolve
-from ipjax.files.weights.found import list_weights
+from ipjax.files.weights.local import list_weights
 
 pytestmark = pytest.mark.usefixtures("weights_cache")
 
@@ -97,7 +96,7 @@ def test_an_installed_package_comes_last(carrier, tmp_path, weights_cache, monke
 
 
 def test_what_is_not_here_is_a_sentence(weights_cache, monkeypatch):
-    for module in (finding, found_module):
+    for module in (finding, local):
         monkeypatch.setattr(module, "find_installed", lambda _: None)
     with pytest.raises(WeightsError, match="no weights are here: run `ipjax weights fetch vits14_reg`"):
         resolve()

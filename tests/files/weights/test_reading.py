@@ -26,8 +26,8 @@ from safetensors.numpy import save_file
 from ipjax.files.weights.catalogue import CATALOGUE, WeightsError
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.files.weights.finding import resolve
-from ipjax.files.weights.found import find_installed
 from ipjax.files.weights.hashes import hash_file
+from ipjax.files.weights.local import find_installed
 from ipjax.files.weights.onnx import read_onnx
 from ipjax.files.weights.parameters import build_model
 from ipjax.files.weights.pickles import read_pth
