@@ -129,7 +129,7 @@ class Estimator:
 def check_size(
     found: PoseEstimate, info: ObjectInfo, diameter: float | None = None, least: float = 0.5
 ) -> tuple[PoseEstimate, str]:
-    """The estimate with less confidence where its size is not the one that the mesh file says.
+    """The estimate with less confidence where its size is not that of the mesh file.
 
     Args:
         found: an estimate of the object.

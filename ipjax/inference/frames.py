@@ -56,7 +56,7 @@ def frame(
         depth_scale: metres per depth unit (0.001 for millimetres); default: the camera file's, else 1 for floats.
         resolution: side of the crop in pixels.
         crop: "square" keeps the camera's axes, so the result's pose is the camera's; "look_at" turns the camera until
-            the mask's centre is on its axis: use `frame_turned`, which also says how it was turned.
+            the mask's centre is on its axis: use `frame_turned`, which also returns that rotation.
         background: colour outside the mask: "black", "grey" or "keep".
         pad: the crop's side is (1 + pad) times the longer side of the mask's box.
         erosion: pixels of the mask's rim whose depth is not trusted.

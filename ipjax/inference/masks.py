@@ -1,4 +1,4 @@
-"""The object's mask in a frame: told from depth inside a box, and without specks."""
+"""The object's mask in a frame: found by depth inside a box, and without specks."""
 
 import cv2
 import numpy as np

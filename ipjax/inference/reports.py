@@ -1,4 +1,4 @@
-"""Estimates as JSON: every frame and unit named, and poses told in the user's own mesh coordinates."""
+"""Estimates as JSON: every frame and unit named, and poses in the coordinates of the user's own mesh."""
 
 import dataclasses
 import json
@@ -30,11 +30,11 @@ CONVENTIONS = {
     "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
 }
 
-UNSURE_TURN = 25.0  # degrees of standard deviation from which people are told about it
+UNSURE_TURN = 25.0  # degrees of standard deviation above which reports name the axis
 
 
 def tell_pose(camera_from_b: Similarity[np.ndarray], unit: str) -> dict[str, Any]:
-    """A similarity to camera metres as JSON can say it; `unit` names what the scale is per."""
+    """A similarity to camera metres for JSON; `unit` names what the scale is per."""
     rigid = Similarity(camera_from_b.rotation, camera_from_b.translation, np.ones(()))
     return {
         "matrix": camera_from_b.to_matrix().tolist(),
@@ -57,16 +57,16 @@ def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> Similarit
 
 
 def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict[str, Any]:
-    """The pose relative to the reference photo as JSON can say it, with scale and, where the photo had depth, without.
+    """The pose relative to the reference photo for JSON, with its scale and, where the photo had depth, without.
 
     Raises ValueError as `relative_pose`.
     """
     pose = relative_pose(camera_from_object, info)
     assert info.reference is not None
-    told = tell_pose(pose, "reference_unit")
-    told["reference_unit"] = "m" if info.reference.metric else None
-    told["reference_photo"] = info.reference.file
-    told["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1) / 2, -1, 1))))
+    entry = tell_pose(pose, "reference_unit")
+    entry["reference_unit"] = "m" if info.reference.metric else None
+    entry["reference_photo"] = info.reference.file
+    entry["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1) / 2, -1, 1))))
     if info.reference.metric:
         # A wrong scale about the camera would move the object: it is taken out about the object's centre.
         reference = info.reference
@@ -76,12 +76,12 @@ def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict
         there = camera_from_mesh @ np.asarray(info.mesh_centre, np.float64)[None]
         turn = Similarity(pose.rotation, np.zeros(3), np.ones(()))
         motion = Similarity(pose.rotation, (pose @ there - turn @ there)[0], np.ones(()))
-        told["rigid_motion"] = motion.to_matrix().tolist()
-    return told
+        entry["rigid_motion"] = motion.to_matrix().tolist()
+    return entry
 
 
 def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo, alternatives: int = 4) -> dict:
-    """One object's estimate as JSON can say it; `pose` is null where none was found.
+    """One object's estimate for JSON; `pose` is null where none was found.
 
     ``camera_from_mesh`` maps the coordinates of the user's mesh file to camera metres; ``camera_from_object`` maps the
     normalised object.
@@ -94,7 +94,7 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
             estimate.camera_from_object.scale,
         )
     )
-    told: dict[str, Any] = {
+    entry: dict[str, Any] = {
         "object": info.name,
         "mesh_file": info.mesh_file,
         "mesh_sha256": info.mesh_sha256,
@@ -105,33 +105,33 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
         "camera_from_object": None,
     }
     if not found:
-        return told
+        return entry
     pose, object_from_mesh = estimate.camera_from_object.to_numpy(), info.object_from_mesh.to_numpy()
-    told["camera_from_mesh"] = tell_pose(pose @ object_from_mesh, "mesh_unit")
-    told["camera_from_object"] = tell_pose(pose, "model_unit")
+    entry["camera_from_mesh"] = tell_pose(pose @ object_from_mesh, "mesh_unit")
+    entry["camera_from_object"] = tell_pose(pose, "model_unit")
     if info.reference is not None:
-        told["camera_from_reference_camera"] = tell_relative_pose(estimate.camera_from_object, info)
-    told["size_mm"] = {
+        entry["camera_from_reference_camera"] = tell_relative_pose(estimate.camera_from_object, info)
+    entry["size_mm"] = {
         "diameter": 1e3 * float(pose.scale),
         "box": [1e3 * float(pose.scale) * float(side) for side in np.asarray(templates.extents)],
         "diameter_std": 1e3 * float(estimate.scale_std),
     }
-    told["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
+    entry["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
     turn = np.asarray(estimate.ambiguity, np.float64)
     length = float(np.linalg.norm(turn))
-    told["ambiguity"] = {
+    entry["ambiguity"] = {
         "axis_of_object": (turn / max(length, 1e-12)).tolist(),
         "std_deg": float(np.degrees(length)),
     }
-    told["agreement"] = {
+    entry["agreement"] = {
         part.name: float(getattr(estimate.agreement, part.name)) for part in dataclasses.fields(estimate.agreement)
     }
     if info.metres_per_unit is not None:
-        told["size_from_mesh_mm"] = {"diameter": 1e3 * info.metres_per_unit / info.mesh_scale}
-    told["inliers"] = int(estimate.inliers)
-    told["residual_rms_mm"] = 1e3 * float(estimate.rmse)
-    told["template"] = int(estimate.view)
-    told["alternatives"] = []
+        entry["size_from_mesh_mm"] = {"diameter": 1e3 * info.metres_per_unit / info.mesh_scale}
+    entry["inliers"] = int(estimate.inliers)
+    entry["residual_rms_mm"] = 1e3 * float(estimate.rmse)
+    entry["template"] = int(estimate.view)
+    entry["alternatives"] = []
     scores = np.asarray(estimate.hypotheses.score)
     many = estimate.hypotheses.camera_from_object.to_numpy()
     for i in range(1, min(alternatives + 1, len(scores))):
@@ -139,13 +139,13 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
         finite = all(np.isfinite(x).all() for x in (other.rotation, other.translation, other.scale))
         if scores[i] <= 0 or not finite:
             continue
-        told["alternatives"].append(
+        entry["alternatives"].append(
             {
                 "score": float(scores[i]),
                 "camera_from_mesh": tell_pose(other @ object_from_mesh, "mesh_unit"),
             }
         )
-    return told
+    return entry
 
 
 def to_json(value: Any) -> str:

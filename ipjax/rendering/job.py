@@ -20,7 +20,7 @@ class Renders:
     rgb: UInt8[np.ndarray, "v h w 3"]  # 0 where nothing is
     depth: Float[np.ndarray, "v h w"]  # along z, units of the poses; 0 = nothing
     camera: Camera  # focal and centre [v 2]
-    backend: str  # who drew
+    backend: str  # egl, osmesa, native or raster
     ids: Int[np.ndarray, "v h w"] | None = None  # which mesh, −1 = none; only for scenes
 
     @property

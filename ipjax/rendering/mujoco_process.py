@@ -264,7 +264,7 @@ def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int]
 
 
 def _processor_seconds(pid: int) -> float:
-    """What a process has used of the processor; 0 where the system does not tell."""
+    """Seconds of the processor that a process has used; 0 where the system does not count them."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
