@@ -1,5 +1,5 @@
-"""The entries of a camera file by name, in whatever spelling: without case, punctuation and what a name begins with
-(``camera``, ``image``, ``rgb``).
+"""The entries of a camera file by name in any spelling: case, punctuation and prefixes such as ``camera``, ``image``
+and ``rgb`` are ignored.
 """
 
 import re
@@ -84,7 +84,7 @@ class Fields:
 
 
 def _agree(one: Any, other: Any) -> bool:
-    """Whether two values say the same: a matrix may be a list of rows, of numbers, or a dictionary with data."""
+    """Whether two values are equal: a matrix may be a list of rows, of numbers, or a dictionary with data."""
     lists = [value.get("data") if isinstance(value, dict) else value for value in (one, other)]
     if all(isinstance(value, list) for value in lists):
         try:

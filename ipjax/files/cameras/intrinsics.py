@@ -20,8 +20,8 @@ class Intrinsics:
             projection is another even then. Zeros behind those that a model has are dropped.
         lens: "opencv", "plumb_bob", "rational_polynomial" or "equidistant" (OpenCV's fisheye, Kannala–Brandt), or one
             of their names elsewhere.
-        size: (width, height) in pixels of the images it belongs to, where the file says so.
-        depth_scale: metres per unit of the depth image, where the file says so.
+        size: (width, height) in pixels of the images it belongs to; None where the file has none.
+        depth_scale: metres per unit of the depth image; None where the file has none.
 
     Raises:
         ValueError: not a usable camera, in words.
@@ -71,7 +71,7 @@ def check_depth_scale(scale: Any, what: str = "depth_scale") -> float:
     """Metres per unit of a depth image, as a float; ``what`` begins the message.
 
     Raises:
-        ValueError: no positive number, for instance the name of a unit; the message says which number it has.
+        ValueError: no positive number, for instance the name of a unit; the message gives its number.
     """
     try:
         value = float(scale)
@@ -96,21 +96,21 @@ def list_misfits(intrinsics: Intrinsics, width: int, height: int) -> list[str]:
     found = []
     shares = np.array([(cx + 0.5) / width, (cy + 0.5) / height])
     if np.abs(shares - 0.5).max() > 0.1:
-        said = (
+        sentence = (
             f"the principal point ({cx:.1f}, {cy:.1f}) is far from the middle of the image of {width} × {height} pixels"
         )
         ratio = 2 * shares.mean()
         turned = np.array([(cy + 0.5) / width, (cx + 0.5) / height])
         if shares.min() > 0 and abs(shares[0] / shares[1] - 1) < 0.1 and abs(ratio - 1) > 0.05:
-            said += (
+            sentence += (
                 f": the camera matrix seems to belong to images of about {ratio * width:.0f} × {ratio * height:.0f}; "
                 f"multiply fx, fy, cx and cy by {1 / ratio:.3g}"
             )
         elif np.abs(turned - 0.5).max() < 0.05:
-            said += ": cx and cy look exchanged"
+            sentence += ": cx and cy look exchanged"
         else:
-            said += ": right only where the image was cut out of a larger one"
-        found.append(said)
+            sentence += ": right only where the image was cut out of a larger one"
+        found.append(sentence)
     if intrinsics.lens != "equidistant":
         angles = [2 * np.degrees(np.arctan(side / 2 / f)) for side, f in ((width, fx), (height, fy))]
         if min(angles) < 10 or max(angles) > 120:

@@ -18,7 +18,7 @@ MODELS = {
     "opencv": (0, 4, 5, 8, 12, 14),
 }
 # Names of the same models elsewhere, in lower-case letters and digits. "pinhole" names the projection and leaves the
-# distortion open; "none" says that there is none.
+# distortion open; "none" excludes it.
 ALIASES = {
     "": "pinhole",
     "pinhole": "pinhole",
@@ -173,7 +173,7 @@ def _names_four_coefficients(fields: Fields) -> bool:
 
 
 def is_nonzero(value: Any) -> bool:
-    """Whether there is a number other than zero, or the name of a lens, in what a file says."""
+    """Whether a value of a camera file holds a number other than zero, or the name of a lens."""
     if isinstance(value, dict):
         return any(is_nonzero(item) for key, item in value.items() if str(key).lower() not in ("rows", "cols"))
     if isinstance(value, list):

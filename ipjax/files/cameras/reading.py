@@ -223,7 +223,7 @@ def _is_height_first(pair: list, matrix: np.ndarray) -> bool:
 
 
 def _crop_and_bin(camera: Intrinsics, fields: Fields) -> Intrinsics:
-    """ROS says K of the whole sensor: the images are a part of it (roi), with pixels joined (binning).
+    """The camera of the published images: in ROS, K is of the whole sensor, of which they are a part (roi), binned.
 
     http://docs.ros.org/en/api/sensor_msgs/html/msg/CameraInfo.html
     """
@@ -244,7 +244,7 @@ def _crop_and_bin(camera: Intrinsics, fields: Fields) -> Intrinsics:
     joined = []
     for name in ("binningx", "binningy"):
         value = fields.take(re.compile(f"^{name}$"))
-        joined.append(max(1.0, 1.0 if value is None else as_number(value, "the binning")))  # 0 is said for 1, too
+        joined.append(max(1.0, 1.0 if value is None else as_number(value, "the binning")))  # drivers write 0 for 1
     if size is not None:
         size = (int(size[0] // joined[0]), int(size[1] // joined[1]))
     return replace(camera, matrix=resize(matrix, (joined[0], joined[1]), (1, 1)), size=size)

@@ -23,14 +23,14 @@ def load_npy(path: Path) -> np.ndarray:
             promised = dtype.itemsize
             for side in shape:
                 promised *= int(side)
-            there = path.stat().st_size - file.tell()
-            if promised > there:
-                raise ValueError(f"its header promises {promised:,} bytes, and there are {there:,}")
+            available = path.stat().st_size - file.tell()
+            if promised > available:
+                raise ValueError(f"its header promises {promised:,} bytes, and there are {available:,}")
         check_budget(3 * promised, "an array of this size")
         return np.load(path, allow_pickle=False)
     except Exception as error:  # its header is parsed as Python, which fails in many ways
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"{path}: not a readable npy file ({said})") from None
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{path}: not a readable npy file ({reason})") from None
 
 
 def as_native(array: np.ndarray) -> np.ndarray:

@@ -79,12 +79,12 @@ def remove_sentinel(depth: np.ndarray) -> tuple[np.ndarray, str]:
     if not found:
         return depth, ""
     depth = depth.copy()
-    said = []
+    counts = []
     for extreme in found:
         same = depth == extreme
-        said.append(f"{extreme:g} on {same.mean():.0%} of the pixels")
+        counts.append(f"{extreme:g} on {same.mean():.0%} of the pixels")
         depth[same] = 0
-    return depth, f"depth of {' and '.join(said)} is taken for unknown"
+    return depth, f"depth of {' and '.join(counts)} is taken for unknown"
 
 
 def _read_wide_tiff(path: Path) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""Masks: booleans from whatever they come as; labels and photos are refused where none is asked for."""
+"""Masks as booleans: from 0/1, 0/255, probabilities, soft edges; labels need a number, photos are refused."""
 
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ def _read_values(image: Image.Image, label: int | None) -> np.ndarray:
 
 
 def as_mask(mask: Any, label: int | None = None) -> np.ndarray:
-    """Booleans from whatever masks come as: bool, 0/1, 0/255, probabilities, soft edges; one channel or several.
+    """A mask as booleans, from bool, 0/1, 0/255, probabilities, soft edges; one channel or several.
 
     Args:
         mask: height × width, or height × width × channels, of which a fourth is dropped.

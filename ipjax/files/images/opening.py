@@ -64,7 +64,7 @@ def open_image(path: str | Path, *, load: bool = True, max_side: int | None = No
             width, height = image.size
             needed = 0
             if max_side is not None and image.format in ("JPEG", "MPO") and max(image.size) > max_side:
-                # A progressive file is held as a whole whatever comes out of it.
+                # A progressive JPEG is decoded as a whole, whatever size is asked for.
                 needed = 6 * width * height if image.info.get("progressive") else 0
                 image.draft(None, (max_side, max_side))
             needed += BYTES_PER_PIXEL * image.size[0] * image.size[1]
@@ -79,19 +79,19 @@ def open_image(path: str | Path, *, load: bool = True, max_side: int | None = No
     except MemoryError:
         raise ValueError(f"{path}: out of memory") from None
     except Exception as error:  # decoders of many formats fail in many ways
-        said = str(error).strip().splitlines() or [type(error).__name__]
-        known = isinstance(error, ValueError) and "allowed for one file" in said[0]
-        raise ValueError(f"{path}: {said[0]}" if known else f"{path}: broken image ({said[0]})") from None
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        known = isinstance(error, ValueError) and "allowed for one file" in lines[0]
+        raise ValueError(f"{path}: {lines[0]}" if known else f"{path}: broken image ({lines[0]})") from None
     return image
 
 
 def get_orientation(image: Image.Image) -> int:
-    """How EXIF says that an image is to be turned, 1 (as it is) to 8."""
+    """The EXIF orientation of an image, 1 (upright) to 8; 1 where it has none."""
     if image.info.get(_ORIENTATION_KEPT, 1) != 1:
         return image.info[_ORIENTATION_KEPT]
     try:
         turn = image.getexif().get(ORIENTATION, 1)
-    except Exception:  # whatever a broken block of EXIF raises
+    except Exception:  # a broken block of EXIF raises many kinds
         return 1
     return turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
 

@@ -1,1 +1,1 @@
-"""Meshes, whoever made them: reading, cleaning, sampling, writing."""
+"""Meshes: reading, cleaning, sampling, writing."""

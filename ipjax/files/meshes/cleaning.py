@@ -1,4 +1,4 @@
-"""Repairing what reconstruction leaves."""
+"""Repairing the faults of reconstructed meshes."""
 
 import dataclasses
 
@@ -9,15 +9,17 @@ from scipy.sparse import csgraph
 from ipjax.files.meshes.mesh import Mesh, corner_products, number_places, number_rows, vertex_normals
 
 TINY_AREA = 0.01  # a component with a smaller share of the area ...
-TINY_EXTENT = 0.2  # ... and a smaller share of the bounding box's diagonal is a fleck
-FLECKS = 0.05  # share of the area that flecks may have together, or they are the object's nature and stay
+TINY_EXTENT = 0.2  # ... and a smaller share of the bounding box's diagonal is removed
+TINY_TOTAL = (
+    0.05  # share of the area that such pieces may have together; where they have more they belong to the object
+)
 
 
 def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
-    """Repair what reconstruction leaves, and say what was done: the new mesh, and one sentence per repair.
+    """Repair the faults of reconstructed meshes. Returns the new mesh, and one sentence per repair.
 
     Duplicate vertices are merged (same place, same colour or texture coordinate), faces without area or drawn twice
-    and loose flecks are removed, windings are made consistent and turned outwards (by the signed volume of each
+    and small loose pieces are removed, windings are made consistent and turned outwards (by the signed volume of each
     connected piece), normals are computed anew. Frame and units stay. Raises ValueError where no face is left.
     """
     report = []
@@ -35,13 +37,13 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
         faces, corners, area = faces[~flat], corners[~flat], area[~flat]
     if len(faces) == 0:
         raise ValueError("no face of the mesh has an area")
-    fresh = np.zeros(len(faces), bool)
-    fresh[np.unique(np.sort(corners, axis=1), axis=0, return_index=True)[1]] = True
-    if not fresh.all():
-        report.append(f"removed {_count(int((~fresh).sum()), 'repeated face')}")
-        faces, corners, area = faces[fresh], corners[fresh], area[fresh]
+    first_copy = np.zeros(len(faces), bool)
+    first_copy[np.unique(np.sort(corners, axis=1), axis=0, return_index=True)[1]] = True
+    if not first_copy.all():
+        report.append(f"removed {_count(int((~first_copy).sum()), 'repeated face')}")
+        faces, corners, area = faces[first_copy], corners[first_copy], area[first_copy]
 
-    # Flecks.
+    # Small loose pieces.
     label = _pieces(corners, place_count)
     count = int(label.max()) + 1
     share = np.bincount(label, area, count) / area.sum()
@@ -51,7 +53,7 @@ def clean(mesh: Mesh) -> tuple[Mesh, tuple[str, ...]]:
         np.maximum.at(high, label, mesh.vertices[faces[:, corner]])
     whole = np.linalg.norm(high.max(0) - low.min(0))
     tiny = (share < TINY_AREA) & (np.linalg.norm(high - low, axis=-1) < TINY_EXTENT * whole)
-    if tiny.any() and share[tiny].sum() <= FLECKS:
+    if tiny.any() and share[tiny].sum() <= TINY_TOTAL:
         report.append(f"removed {int(tiny.sum())} of {count} components, {share[tiny].sum():.1%} of the surface")
         keep = ~tiny[label]
         faces, corners, area = faces[keep], corners[keep], area[keep]

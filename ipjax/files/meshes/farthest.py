@@ -1,4 +1,4 @@
-"""The farthest two of many points, by bounds on groups of them rather than by all pairs."""
+"""The largest distance among many points, by bounds on groups of them rather than by all pairs."""
 
 import math
 

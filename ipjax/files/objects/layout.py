@@ -1,7 +1,7 @@
 """How an object file is laid out: names, types and shapes of its tensors, and the checksum of its content.
 
 One safetensors file (https://github.com/huggingface/safetensors). Its metadata holds one JSON text under the
-key ``ipjax``: format version, who the object and the encoder are, how the normalised object frame lies in the user's
+key ``ipjax``: format version, names of the object and the encoder, how the normalised object frame lies in the user's
 mesh, and a checksum. Tensors, for v templates of p patches with c channels:
 
     features f16 [v p f] · mean f32 [c] · norm f32 [v p] · basis f32 [f c]          without the optional basis f = c

@@ -84,7 +84,7 @@ def _make_appearance(tensors: dict[str, np.ndarray]) -> Appearance | None:
 
 
 def check(path: str | Path) -> list[str]:
-    """Read an object file to its last byte and say what it holds.
+    """Read an object file to its last byte, check it, and describe it.
 
     Returns:
         Sentences for a person: the object, its size, who made it, what was noted.

@@ -93,14 +93,14 @@ class ObjectInfo:
         mesh_centre: the object frame's origin in the mesh file's frame, in its units.
         mesh_file: name of the mesh file, without folders.
         mesh_sha256: of the mesh file.
-        metres_per_unit: of the mesh file, where the user said so; None = unknown.
-        config: how it was onboarded, as JSON can say it.
-        notes: what the readers and repairers had to say.
+        metres_per_unit: of the mesh file, as the user gave it; None = unknown.
+        config: how it was onboarded, as plain JSON.
+        notes: what was found and repaired while the mesh was read, a sentence each.
         resolution: side of the template images in pixels.
         vertices, faces, colours: the normalised mesh, for pictures; None = not kept.
         pictures: the template images ``[v h w 3]`` uint8, or the JPEG bytes of each; None = not kept.
         reference: the photo it was made from; None = made from a mesh.
-        content_sha256: of the object file it was read from, as its header says; `check` compares.
+        content_sha256: of the object file it was read from, according to its header; `check` compares.
     """
 
     name: str

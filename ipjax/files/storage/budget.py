@@ -44,10 +44,10 @@ def check_budget(needed: int, what: str) -> None:
 
 
 def check_tensors(path: str | Path, needed: int) -> None:
-    """Refuse tensors that would take more memory than their file could fill: many of them may lie in one place of it.
+    """Refuse tensors that would take more memory than their file could fill: many may share one place in it.
 
-    Files of weights may be larger than the budget of other files; what they say is true takes at most their own size,
-    and twice where two names share a tensor.
+    Files of weights may be larger than the budget of other files. Honest tensors take at most the size of their file,
+    and twice that where two names share one.
 
     Args:
         needed: bytes of all tensors.
@@ -67,7 +67,7 @@ def read_safetensors_header(path: str | Path) -> int:
     """The length of the description at the head of a safetensors file, bytes, before anything parses it.
 
     Raises:
-        ValueError: a length that the file has not, or that no honest file needs; does not name the file.
+        ValueError: longer than the file, or than any valid file needs; does not name the file.
         OSError: the file cannot be read.
     """
     with open(path, "rb") as file:

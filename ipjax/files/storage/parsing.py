@@ -154,7 +154,7 @@ def _yaml_loader() -> type:
                 said = f"more than {_MAX_YAML_NODES:,} values, aliases counted as what they stand for"
                 raise yaml.MarkedYAMLError(None, None, said, mark)
 
-    # YAML 1.1 takes 1e-3 for a word; whoever writes it means a number.
+    # YAML 1.1 takes 1e-3 for a word; in the files that are read here it is a number.
     number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+\Z")
     Loader.add_implicit_resolver("tag:yaml.org,2002:float", number, list("-+0123456789."))
     for kind in ("opencv-matrix", "opencv-nd-matrix"):

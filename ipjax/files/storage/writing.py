@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, also after a crash and whoever else writes them."""
+"""Files that appear whole or not at all, also after a crash and with several writers."""
 
 import contextlib
 import json
@@ -12,16 +12,16 @@ from typing import Any
 
 # Names of unfinished files: hidden, and with the ending of the file that they become.
 _UNFINISHED = re.compile(r"\..*\.[0-9a-f]{12}\.part(\..*)?", re.DOTALL)
-_ABANDONED = 24 * 3600  # seconds without a change, after which whoever wrote an unfinished file has been killed
+_ABANDONED = 24 * 3600  # seconds without a change, after which the writer of an unfinished file counts as killed
 _SEARCH_AGAIN = 3600  # seconds until a folder is searched for abandoned files once more
 _searched: dict[Path, float] = {}  # folder: when it was
 
 
 @contextlib.contextmanager
 def writing(path: str | Path, *, parents: bool = False) -> Iterator[Path]:
-    """Write a file that appears whole or not at all, also after a crash and whoever else writes it.
+    """Write a file that appears whole or not at all, also after a crash and with several writers.
 
-    Yields a name of its own in the same folder, with the same ending, where an empty file lies. When the block ends,
+    Yields a name of its own in the same folder, with the same ending, with an empty file. When the block ends,
     what was written there is flushed to disc and gets the name ``path``; when the block fails, it is removed.
 
     What earlier writers left unfinished in the folder because they were killed is removed, once it is a day old.

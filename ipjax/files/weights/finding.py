@@ -19,7 +19,7 @@ _log = logging.getLogger("ipjax.weights")
 
 
 def is_offline(offline: bool | None = None) -> bool:
-    """Whether downloads are forbidden: as told, else by IPJAX_OFFLINE or HF_HUB_OFFLINE."""
+    """Whether downloads are forbidden: by the argument, else by IPJAX_OFFLINE or HF_HUB_OFFLINE."""
     if offline is not None:
         return offline
     return any(
@@ -34,7 +34,7 @@ def resolve(
     *,
     download: bool = False,
 ) -> Resolved:
-    """Find weights, and say which: explicit path → cache → official download → installed package.
+    """Find weights, and log which: explicit path → cache → official download → installed package.
 
     The network is touched only with ``download=True``, and never when ``offline`` (default: the environment) says so.
     Without a name, ``PREFERRED`` decides: the official ViT-S with registers, without, then what a package carries.
@@ -74,7 +74,7 @@ def resolve(
 
 
 def _in_model_folder(path: Path) -> Path:
-    """The file itself, where a Hugging Face model folder is meant."""
+    """The weights file in a Hugging Face model folder; any other path as it is."""
     inside = path / "model.safetensors"
     return inside if path.is_dir() and inside.is_file() else path
 
@@ -100,7 +100,7 @@ def fetch(name: str | None = None, from_package_index: bool = False, offline: bo
 
 
 def find_path(name: str | None = None) -> Path:
-    """Where the weights lie; WeightsError when they are not here. Never downloads."""
+    """The path of the weights. Never downloads; raises WeightsError when they are not here."""
     return resolve(name).path
 
 
@@ -111,7 +111,7 @@ def locate(path_or_name: str | Path | None, *, download: bool) -> Resolved:
     if isinstance(path_or_name, str) and not Path(path_or_name).expanduser().exists():
         if Path(path_or_name).suffix or os.sep in path_or_name:
             raise WeightsError(f"there is no weights file at {path_or_name}")
-        find_source(path_or_name)  # a misspelt name: says what is known
+        find_source(path_or_name)  # a misspelt name: the error lists those that are known
     return resolve(explicit=path_or_name)
 
 

@@ -1,4 +1,4 @@
-"""The encoder that made some object files: found by what they say of it, refused by name where it is another."""
+"""The encoder that made some object files, found by the identity in them."""
 
 import re
 from collections.abc import Sequence

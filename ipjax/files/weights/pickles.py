@@ -46,7 +46,7 @@ class _Kind(NamedTuple):
 
 
 def _strided(storage: Any, offset: Any, shape: Any, strides: Any) -> np.ndarray:
-    """The tensor that lies in ``storage`` (flat) with these strides, not copied; ValueError where it reaches beyond."""
+    """A view of ``storage`` (flat) with these strides; ValueError where it reaches beyond."""
     numbers = (offset, *shape, *strides)
     if not isinstance(storage, np.ndarray) or not all(isinstance(n, int) and n >= 0 for n in numbers):
         raise ValueError("a tensor is described by something other than sizes")
@@ -100,8 +100,8 @@ def _unpickle(program: bytes, load: Callable[[str, np.dtype], np.ndarray]) -> An
 def read_pth(path: str | Path) -> dict[str, np.ndarray]:
     """The tensors of a ``.pth`` file that holds a plain state dict; ValueError, in words, for anything else.
 
-    They lie where their storages do, so that many views of one cost nothing; whoever copies them is told here when
-    that would take more memory than the file could fill.
+    They are views of their storages, so that many of one cost nothing. Copies of them might: a file whose tensors would
+    take more memory than it has bytes is refused.
     """
     try:
         with zipfile.ZipFile(path) as archive:

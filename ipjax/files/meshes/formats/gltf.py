@@ -257,7 +257,7 @@ class _Scene:
         return np.stack([corners[step], corners[step + 1 + odd], corners[step + 2 - odd]], axis=-1)
 
     def colours(self, index: Any, count: int) -> np.ndarray:
-        """COLOR_0 as linear light (3.7.2.1); whole numbers are normalised, whether the file says so or not."""
+        """COLOR_0 as linear light (3.7.2.1); whole numbers are always normalised."""
         rows, _ = self.document.accessor(index, ("VEC3", "VEC4"))
         if len(rows) != count:
             raise ValueError(f"has {len(rows)} colours for {count} vertices")

@@ -132,7 +132,7 @@ class Document:
         return self.buffers[index]
 
     def resource(self, uri: Any) -> bytes:
-        """The bytes of a URI: in the JSON itself, or in a file beside it."""
+        """The bytes of a URI: in the JSON itself, or in a file in its folder."""
         if not isinstance(uri, str):
             raise ValueError("has a uri that is no text")
         if uri[:5].lower() == "data:":
@@ -168,7 +168,7 @@ class Document:
         return data, offset, length, self.number(entry, "byteStride", 0, 65536)
 
     def strided(self, entry: dict, kind: str, width: int, count: int) -> np.ndarray:
-        """`count` rows of `width` numbers where a view and an offset say; a copy."""
+        """A copy of `count` rows of `width` numbers, found by a view and an offset."""
         data, start, length, stride = self.view(entry.get("bufferView"))
         offset = self.number(entry, "byteOffset")
         size = np.dtype(kind).itemsize
@@ -182,7 +182,7 @@ class Document:
         return np.ndarray((count, width), kind, data, start + offset, (stride, size)).copy()
 
     def accessor(self, index: Any, shapes: tuple[str, ...]) -> tuple[np.ndarray, bool]:
-        """The rows of an accessor as stored, and whether they are said to be normalised; sparse ones too (3.6.2)."""
+        """The rows of an accessor as stored, sparse ones too, and whether it is marked as normalised (3.6.2)."""
         entry = self.item("accessors", index)
         kind, shape = TYPES.get(as_key(entry.get("componentType"))), entry.get("type")
         if kind is None or shape not in shapes:
@@ -210,7 +210,7 @@ class Document:
 
 
 def as_key(value: Any) -> Any:
-    """A value that may be looked up: hostile JSON has lists where numbers belong."""
+    """A value that can be a key of a dictionary, else None: invalid JSON has lists where numbers belong."""
     return value if isinstance(value, int | str) else None
 
 

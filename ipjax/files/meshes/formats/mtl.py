@@ -1,4 +1,4 @@
-"""MTL: the materials of OBJ files, as far as colour goes, in whatever encoding."""
+"""MTL: the colours and images of OBJ files' materials, in any encoding."""
 
 import dataclasses
 from pathlib import Path
@@ -14,7 +14,7 @@ WORDS = {b"-blendu": 1, b"-blendv": 1, b"-cc": 1, b"-clamp": 1, b"-imfchan": 1, 
 
 @dataclasses.dataclass
 class Material:
-    """What an MTL file says of one material, as far as colour goes."""
+    """Colour and image of one material."""
 
     colour: tuple[float, float, float] | None = None  # Kd, sRGB as it is
     image: bytes | None = None
@@ -24,7 +24,7 @@ class Material:
 
 
 def find_materials(source: Source, libraries: list[bytes], wanted: dict[bytes, int]) -> dict[int, Material]:
-    """The materials that faces use, by their number; those beside the mesh where it names none that are there."""
+    """The materials that faces use, by number; of the MTL file with the mesh's name where its own are missing."""
     found: dict[bytes, Material] = {}
     read: set[Path] = set()
     missing = []

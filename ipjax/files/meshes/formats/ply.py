@@ -64,7 +64,7 @@ def read_colours(table: dict[str, np.ndarray]) -> np.ndarray | None:
             kind = table[names[0]].dtype
             values = np.nan_to_num(values.astype(np.float64))
             most = values.max(initial=0.0)
-            # Fractions, bytes in floats, bytes in wider numbers, sixteen bits: their range tells.
+            # Fractions, bytes in floats, bytes in wider numbers, and sixteen bits are told apart by their range.
             top = 1.0 if kind.kind == "f" and most <= 1.5 else 255.0 if most <= 255 else 65535.0
             return np.round(np.clip(values / top, 0, 1) * 255).astype(np.uint8)
     return None

@@ -31,7 +31,7 @@ class Property:
 
 @dataclasses.dataclass
 class Element:
-    """What the header says of one kind of row."""
+    """One kind of row: its name, how many there are, and its properties."""
 
     name: str
     count: int

@@ -28,7 +28,7 @@ def check_faces(count: int) -> None:
 
 
 class Source:
-    """One mesh file: the files beside it, the bytes that it may still become, and what its reader has to say."""
+    """One mesh file: the files in its folder, the memory that it may still take, and notes on what was found."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -56,13 +56,13 @@ class Source:
         self.take(vertices * VERTEX_BYTES + faces * FACE_BYTES, f"{vertices:,} vertices and {faces:,} faces")
 
     def warn(self, sentence: str) -> None:
-        """Something of the file is not read; said once, and of a file where much is missing the first few."""
+        """Note what is not read of the file: each sentence once, and at most MAX_WARNINGS of them."""
         if sentence in self.warnings or len(self.warnings) > MAX_WARNINGS:
             return
         more = "there is more that is not read"
         self.warnings.append(sentence if len(self.warnings) < MAX_WARNINGS else more)
 
-    # Files beside it.
+    # Files in its folder.
 
     def read(self) -> bytes:
         """The file itself."""
@@ -72,7 +72,7 @@ class Source:
         return data
 
     def find(self, name: str | bytes, quoted: bool = False) -> Path | None:
-        """The file that is meant by a name in the mesh file, which need not be in UTF-8 nor in the right case.
+        """The file of a name in the mesh file, which need not be in UTF-8 nor in the right case.
 
         None where there is none. Raises ValueError for a name that leads out of the mesh's folder.
         """
@@ -98,7 +98,7 @@ class Source:
         return None
 
     def read_beside(self, path: Path) -> bytes:
-        """The bytes of a file beside the mesh, counted."""
+        """The bytes of a file in the mesh's folder, counted."""
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise ValueError(f"names a file of {size / 1e9:.1f} GB: {path.name}")
@@ -125,7 +125,7 @@ class Source:
         return texture
 
     def guess_texture(self) -> Texture | None:
-        """The image beside a mesh that names none but has texture coordinates, where its name says whose it is."""
+        """The image in the folder of a mesh that names none but has texture coordinates, if its name fits the mesh."""
         folder, stem = self.path.parent, self.path.stem.lower()
         try:
             files = sorted(path for path in folder.iterdir() if path.is_file())
