@@ -90,12 +90,12 @@ def test_quickstart_is_ten_lines():
 
 def test_commands_exist():
     """Every `ipjax` command and every option in the README is one that the command line takes."""
-    from ipjax.cli import _parser
+    from ipjax.cli import build_parser
 
     joined = "\n".join(find_blocks("sh")).replace("\\\n", " ")
     lines = [line.split("#")[0].split() for line in joined.splitlines() if line.startswith("ipjax ")]
     assert len(lines) >= 4
-    parser = _parser()
+    parser = build_parser()
     for words in lines:
         try:
             parser.parse_args(words[1:])

@@ -1,1 +1,1 @@
-"""What `ipjax` runs."""
+"""What `ipjax` runs: one file a command. Each imports what it needs when it runs, so that ``--help`` is instant."""

@@ -1,34 +1,76 @@
-"""What works on this machine: versions, devices, renderers, weights, and a self-test of seconds."""
+"""``ipjax doctor``: what works on this machine: versions, devices, renderers, weights, and a self-test of seconds."""
 
-import importlib.metadata
+import argparse
 import os
 import platform
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
-import numpy as np
+from ipjax.commands.interface import options
+from ipjax.commands.interface.messages import NO_DEVICE, Messages
+from ipjax.commands.interface.parser import add_command
 
+EXAMPLES = """\
+examples:
+  ipjax doctor
+  ipjax doctor mug.ipjax box.ipjax
+  ipjax doctor --json > machine.json        to be sent along with a question
+"""
 Line = tuple[bool, str, str]  # fine, subject, what there is to say
 
-# What JAX says of this is an assertion, or a page.
-NO_DEVICE = (
-    "JAX_PLATFORMS={} asks for devices that JAX does not have here; unset it, or install what they need "
-    "(pip install 'ipjax[cuda]' for NVIDIA)"
-)
 _PACKAGES = ("jax", "jaxlib", "flax", "equinox", "optimistix", "mujoco", "trimesh", "opencv-python-headless", "numpy")
+
+
+def add(commands: Any) -> None:
+    """The command and its options."""
+    parser = add_command(
+        commands, "doctor", run, "say what works on this machine, and check object files to their last byte", EXAMPLES
+    )
+    parser.add_argument("objects", metavar="OBJ.ipjax", type=Path, nargs="*", help="object files to check")
+    options.add_reporting(parser)
+
+
+def run(arguments: argparse.Namespace, messages: Messages) -> int:
+    """Look at everything, or at the object files given; returns the exit status: 1, something needed is missing."""
+    if arguments.objects:
+        return _run_files(arguments.objects, messages)
+    told = []
+    for good, subject, said in examine():
+        messages.say(f" {subject:24} {said}", mark="ok " if good else "BAD", style="green" if good else "bold red")
+        told.append({"fine": good, "subject": subject, "said": said})
+    fine = all(line["fine"] for line in told)
+    messages.say("everything needed works" if fine else "something needed is missing: see the lines marked BAD")
+    messages.finish({"fine": fine, "checks": told})
+    return 0 if fine else 1
+
+
+def _run_files(paths: list[Path], messages: Messages) -> int:
+    from ipjax.files.objects.loading import check
+
+    told = []
+    for path in paths:
+        lines = check(path)
+        messages.say("\n".join([f"{path}: {lines[0]}", *(f"  {line}" for line in lines[1:])]))
+        told.append({"object_file": str(path), "said": lines})
+    messages.finish({"fine": True, "objects": told})
+    return 0
 
 
 def examine() -> Iterator[Line]:
     """One line for each thing looked at, in the order in which they are needed; nothing raises."""
+    from importlib import metadata
+
     from ipjax import __version__
 
     system = f"{platform.system()} {platform.machine()}"
     yield True, "ipjax", f"{__version__}, Python {sys.version.split()[0]} on {system}"
     for name in _PACKAGES:
         try:
-            yield True, name, importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
+            yield True, name, metadata.version(name)
+        except metadata.PackageNotFoundError:
             # OpenCV comes under several names.
             fine = name.startswith("opencv") and _imports("cv2")
             yield fine, name, "another build of OpenCV" if fine else f"missing: pip install {name}"
@@ -47,6 +89,7 @@ def self_test() -> Line:
     """Recover a known similarity from points with outliers, through the compiled solver."""
     import jax
     import jax.numpy as jnp
+    import numpy as np
 
     start = time.perf_counter()
     try:
@@ -103,9 +146,9 @@ def _weights() -> Iterator[Line]:
 
 
 def _imports(name: str) -> bool:
-    import importlib.util
+    from importlib.util import find_spec
 
-    return importlib.util.find_spec(name) is not None
+    return find_spec(name) is not None
 
 
 def _first_line(error: BaseException) -> str:

@@ -159,27 +159,28 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
     return typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
 
 
-def _is_number(value: Any) -> bool:
-    """Whether this is a number, or infinite as `describe_config` writes it."""
+def _number(value: Any) -> float | None:
+    """A number, finite or not, also where it is written as `describe_config` does; None for anything else."""
     if value in ("inf", "-inf"):
-        return True
+        return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) < 1e300 or value in (math.inf, -math.inf)
+        return None
+    return float(value) if abs(value) < 1e300 or value in (math.inf, -math.inf) else None
 
 
 def _checked(value: Any, hint: Any, old: Any, where: str) -> Any:
     """The value as the field holds it; ValueError says what the field expects."""
     for kind in _kinds(hint):
         if typing.get_origin(kind) is tuple:
-            if isinstance(value, list) and len(value) == len(old) and all(map(_is_number, value)):
-                return tuple(float(x) for x in value)
+            numbers = [_number(x) for x in value] if isinstance(value, list) else [None]
+            if len(numbers) == len(old) and None not in numbers:
+                return tuple(numbers)
         elif typing.get_origin(kind) is typing.Literal:
             if value in typing.get_args(kind):
                 return value
         elif kind is float:
-            if _is_number(value):
-                return float(value)
+            if (number := _number(value)) is not None:
+                return number
         elif type(value) is kind:
             return value
     raise ValueError(

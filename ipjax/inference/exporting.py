@@ -20,6 +20,7 @@ from jaxtyping import Array
 from ipjax import __version__
 from ipjax.config import Config
 from ipjax.estimation.pipeline import estimate
+from ipjax.files.settings import describe_config
 from ipjax.files.storage.writing import write_bytes, write_text
 from ipjax.records import Camera, Patches, Query, Similarity, Surface, Templates, View
 
@@ -142,6 +143,7 @@ def export(
         "readable": PROMISE,
         "platforms": list(PLATFORMS),
         "batch": batch,
+        "config": describe_config(config),
         "encoder": templates.patches.encoder,  # who must describe the queries; null = not known
         "inputs": _describe({"templates": arguments[0], "query": arguments[1], "key": arguments[2]}),
         "outputs": _describe(jax.tree.unflatten(exported.out_tree, exported.out_avals)),

@@ -75,7 +75,7 @@ def test_thousands_of_estimates_in_a_file_agree_with_the_toolkit(tmp_path, monke
     shuffled = [rows[i] for i in np.random.default_rng(2).permutation(len(rows))]
     path = bop.write_results(tmp_path / "other_lmo-test.csv", shuffled)
     assert len(rows) > 2000
-    assert cli.main(["score", str(path), str(root), "--json", str(tmp_path / "score.json")]) == 0
+    assert cli.main(["score", str(path), str(root), "-o", str(tmp_path / "score.json")]) == 0
     assert "scored without VSD" in capfd.readouterr().out
     found = json.loads((tmp_path / "score.json").read_text())["all_frames"]
     assert found["targets"] == copies * int(PROTOCOL["targets_count"])
@@ -769,7 +769,7 @@ def test_an_estimator_that_returns_no_pose_is_told(small, tmp_path):
 
 def test_the_command_scores_and_goes_on_where_asked(scored, tmp_path):
     bad = "0,1,2,1.0,1 0 0 0 1 0 0 0,0 0 700,1"
-    status, out, _ = scored(rows(bad), "--skip-bad", "--without", "0/1", "--json", str(tmp_path / "score.json"))
+    status, out, _ = scored(rows(bad), "--skip-bad", "--without", "0/1", "-o", str(tmp_path / "score.json"))
     assert status == 0 and "1 problems, the first: " in out and "R must hold 9 numbers" in out
     assert "all frames, without 0/1" in out
     kept = json.loads((tmp_path / "score.json").read_text())

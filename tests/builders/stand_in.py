@@ -9,9 +9,10 @@ import time
 
 import equinox as eqx
 
-import ipjax.cli
 from benchmarks import evaluation
+from ipjax import cli
 from ipjax.bop import run as studies
+from ipjax.commands.interface import options
 from ipjax.synthetic.problems import CoordinateEncoder, make_encoder
 
 
@@ -23,7 +24,7 @@ class Named(CoordinateEncoder):
 
 plain = make_encoder()
 encoder = Named(plain.frequencies, plain.phases)
-ipjax.cli._load_encoder = lambda arguments: encoder
+options.load_encoder = lambda arguments: encoder
 evaluation.load_encoder = lambda *_, **__: encoder
 estimate = studies.Finder.__call__
 
@@ -35,7 +36,7 @@ def slowly(finder, frame, targets):
 
 studies.Finder.__call__ = slowly
 if sys.argv[2] == "ipjax":
-    sys.exit(ipjax.cli.main(sys.argv[3:]))
+    sys.exit(cli.main(sys.argv[3:]))
 
 made: list[studies.Finder] = []
 beside = studies.Finder.beside

@@ -272,7 +272,7 @@ def test_the_command_refuses_in_one_line(words, answer, tmp_path, monkeypatch, c
 def test_a_photo_goes_through_the_command(encoder, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("IPJAX_NO_CACHE", "1")
     monkeypatch.setenv("IPJAX_CACHE", str(tmp_path))
-    monkeypatch.setattr(cli, "_load_encoder", lambda arguments: encoder)
+    monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: encoder)
     rgb, mask, _ = ball()
     Image.fromarray(np.dstack([rgb, np.uint8(255) * mask.astype(np.uint8)])).save(tmp_path / "ball.png")
     out, mesh = tmp_path / "ball.ipjax", tmp_path / "ball.glb"
@@ -285,7 +285,7 @@ def test_a_photo_goes_through_the_command(encoder, monkeypatch, tmp_path, capsys
 
 def test_too_many_channels_are_refused_before_anything_is_drawn(encoder, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("IPJAX_NO_CACHE", "1")
-    monkeypatch.setattr(cli, "_load_encoder", lambda arguments: encoder)
+    monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: encoder)
     monkeypatch.setattr("ipjax.onboarding.mesh.render", lambda *_, **__: pytest.fail("views were rendered"))
     rgb, mask, _ = ball()
     Image.fromarray(np.dstack([rgb, np.uint8(255) * mask.astype(np.uint8)])).save(tmp_path / "ball.png")

@@ -1,0 +1,240 @@
+"""``ipjax estimate``: where are the objects in a frame, or in every frame of a folder?"""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from ipjax.commands.interface import options
+from ipjax.commands.interface.frames import FrameFiles, Images, choose_masks, list_frames, read_frame
+from ipjax.commands.interface.messages import Messages, in_one_line
+from ipjax.commands.interface.parser import add_command
+
+EXAMPLES = """\
+examples:
+  ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png -o pose.json
+  ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json \\
+      --mask mug.png --mask box.png --overlay out.png       several objects: one mask (or box) each, in their order
+  ipjax estimate mug.ipjax --rgb a.png --depth a.npy --camera 600,600,320,240 --box 210,130,90,120
+  ipjax estimate mug.ipjax --frames scene/ -o poses.json --overlay pictures/
+  ipjax estimate mug.ipjax --frames scene/ --config fast --set match.views=4 --json | jq .frames[].objects
+
+A folder of frames holds rgb/ and depth/ with one file of the same name per frame, mask/ (or masks/, mask_visib/) with
+NAME.png for one object or NAME_000000.png, NAME_000001.png … for several, and a camera file: scene_camera.json (BOP),
+camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine numbers). In a scene of BOP, scene_gt.json
+says which of the masks is of which object: obj_000005.ipjax is its object 5, for other names --obj-id says it.
+
+Depth of whole numbers needs a unit: --depth-scale 0.001 for millimetres, unless the camera file has BOP's depth_scale.
+The pose in the JSON maps the coordinates of your mesh file to camera metres; every frame and unit is named there.
+For an object made from a photo it also has the pose relative to that photo. Where that photo had depth, the size it
+measured is kept; --size says another, --free-size lets it be found.
+"""
+
+
+def add(commands: Any) -> None:
+    """The command and its options."""
+    parser = add_command(
+        commands, "estimate", run, "find objects in an RGB-D frame, or in a folder of frames", EXAMPLES
+    )
+    parser.add_argument("objects", metavar="OBJ.ipjax", type=Path, nargs="+", help="object files, from 'ipjax onboard'")
+    parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image")
+    options.add_depth(parser, "depth aligned to it: 16-bit PNG, TIFF or npy")
+    options.add_mask(parser, "the object's visible pixels", "instead of a mask, pixels", many=True)
+    parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
+    parser.add_argument(
+        "--instance",
+        type=int,
+        metavar="N",
+        action="append",
+        help="with --frames: the mask NAME_00000N.png is the object's; one for each object",
+    )
+    parser.add_argument(
+        "--obj-id",
+        type=int,
+        metavar="N",
+        action="append",
+        help="with --frames and a scene_gt.json: which object of it; one for each object (default: from its name)",
+    )
+    size = parser.add_mutually_exclusive_group()
+    size.add_argument("--size", type=float, metavar="MM", help="the object's true diameter in millimetres, if known")
+    size.add_argument("--diameter", type=float, metavar="METRES", help="the same in metres")
+    size.add_argument("--free-size", action="store_true", help="find the size even where the reference photo told it")
+    options.add_crop(parser)
+    options.add_config(parser)
+    options.add_seed(parser)
+    options.add_output(parser, "JSON", "where the poses go (default: a line for each object on the screen)")
+    parser.add_argument("--overlay", type=Path, metavar="PNG", help="a picture of the result (with --frames: a folder)")
+    options.add_weights(parser)
+    options.add_reporting(parser, quiet="no notes on stderr")
+
+
+def run(arguments: argparse.Namespace, messages: Messages) -> int:
+    """Estimate, tell and draw; returns the exit status, 1 where no object is present in any frame."""
+    frames = list_frames(arguments)
+    _check(arguments)
+    from ipjax.files.objects.loading import load
+    from ipjax.files.weights.matching import load_matching_encoder
+    from ipjax.inference.compilation_cache import use_compilation_cache
+
+    config = options.read_config(arguments)
+    many = arguments.frames is not None
+    first = _read_first(frames[0], arguments) if not many else None
+    objects = [load(path) for path in arguments.objects]
+    if many:
+        choose_masks(frames, [info.name for _, info in objects], arguments)
+    identities = [info.encoder for _, info in objects]
+    encoder = load_matching_encoder(arguments.objects, identities, arguments.weights)
+    messages.tell()
+    use_compilation_cache()
+    from ipjax.files.storage.writing import write_text
+    from ipjax.inference.estimator import Estimator
+    from ipjax.inference.reports import CONVENTIONS, to_json
+
+    estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
+    told: list[dict[str, Any]] = []
+    for files in frames:
+        try:
+            told.append(_estimate_frame(files, first, estimator, arguments, messages))
+        except (ValueError, OSError) as error:
+            if not many:
+                raise
+            told.append({"frame": files.name, "error": in_one_line(error)})
+            messages.note(f"{files.name}: {in_one_line(error)}")
+            continue
+        messages.tell()
+        if arguments.output is None or not arguments.quiet:
+            for one in told[-1]["objects"]:
+                messages.say(_summary(files.name, one))
+    if many and all("error" in entry for entry in told):
+        raise ValueError(f"{arguments.frames}: no frame could be used; the first: {told[0]['error']}")
+    text = to_json(
+        {
+            "format": "ipjax poses 1",
+            "conventions": CONVENTIONS,
+            "config": arguments.config,
+            "set": arguments.changes,
+            "seed": arguments.seed,
+            "frames": told,
+        }
+    )
+    if arguments.output is not None:
+        write_text(arguments.output, text)
+    messages.finish(text)
+    found = [one["present"] for entry in told for one in entry.get("objects", ())]
+    return 0 if any(found) else 1
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuse what cannot be done before the work; ``--size`` becomes ``--diameter``."""
+    for name in ("mask_label", "instance", "obj_id"):
+        if len(getattr(arguments, name) or ()) not in (0, len(arguments.objects)):
+            raise ValueError(f"--{name.replace('_', '-')} is given once for each object, in their order")
+    if arguments.output is not None:
+        options.check_output(arguments.output, (".json",))
+    if arguments.overlay is not None and arguments.frames is None:
+        options.check_output(arguments.overlay, options.PICTURES)
+    elif arguments.overlay is not None and arguments.overlay.exists() and not arguments.overlay.is_dir():
+        raise ValueError(f"{arguments.overlay}: with --frames, the overlay is a folder")
+    if arguments.size is not None:
+        if not 1 <= arguments.size < 1e5:
+            raise ValueError(f"--size is in millimetres; {arguments.size:g} cannot be right")
+        arguments.diameter = 1e-3 * arguments.size
+    if arguments.diameter is not None and not 1e-4 < arguments.diameter < 100:
+        raise ValueError(f"--diameter is in metres; {arguments.diameter:g} cannot be right")
+    options.check_seed(arguments.seed)
+
+
+def _read_first(files: FrameFiles, arguments: argparse.Namespace) -> Images:
+    """A single frame: what is cheap to refuse is refused before weights are loaded and anything is compiled."""
+    from ipjax.inference.frames import frame
+
+    images = read_frame(files, arguments)
+    for mask, box in zip(images.masks, files.boxes, strict=True):
+        scale, crop = arguments.depth_scale, arguments.crop
+        frame(images.rgb, images.depth, mask, images.camera, box=box, depth_scale=scale, crop=crop)
+    return images
+
+
+def _estimate_frame(
+    files: FrameFiles, images: Images | None, estimator: Any, arguments: argparse.Namespace, messages: Messages
+) -> dict[str, Any]:
+    """What is told of one frame; its picture is drawn. ``images``: where it has been read already."""
+    from ipjax.inference.reports import tell_estimate
+
+    warned = len(messages.warnings)
+    if images is None:
+        images = read_frame(files, arguments)
+    crops = []
+    for i, (mask, box) in enumerate(zip(images.masks, files.boxes, strict=True)):
+        start = time.perf_counter()
+        crop = estimator.frame(i, images.rgb, images.depth, mask, images.camera, box)
+        crops.append((crop, time.perf_counter() - start))
+    entries, results = [], []
+    for i, (crop, seconds) in enumerate(crops):
+        info = estimator.objects[i][1]
+        # A reference photo with depth has measured the size; else it is free, unless the user knows it.
+        given = arguments.diameter is not None or arguments.free_size
+        diameter = arguments.diameter if given else info.measured_diameter
+        result = estimator.run(i, *crop, seed=arguments.seed, diameter=diameter)
+        for line in result.warnings:
+            messages.keep(line, is_warning=True)
+        results.append(result)
+        entries.append(
+            {
+                "object_file": str(arguments.objects[i]),
+                "mask": None if files.masks[i] is None else str(files.masks[i]),
+                **tell_estimate(result.estimate, result.templates, result.info),
+                "size_given_mm": None if diameter is None else 1e3 * diameter,
+                "stage_seconds": {
+                    name: round(value, 6) for name, value in ({"frame": seconds} | result.seconds).items()
+                },
+            }
+        )
+    told = {
+        "frame": files.name,
+        "rgb": str(files.rgb),
+        "read_seconds": images.seconds,
+        "warnings": list(dict.fromkeys(messages.warnings[warned:])),
+        "objects": entries,
+    }
+    if arguments.overlay is not None:
+        start = time.perf_counter()
+        told["overlay"] = str(_draw(files.name, images, results, estimator.config, arguments))
+        told["draw_seconds"] = round(time.perf_counter() - start, 6)
+    return told
+
+
+def _draw(name: str, images: Images, results: list[Any], config: Any, arguments: argparse.Namespace) -> Path:
+    """Write the picture of one frame; where it is."""
+    import numpy as np
+
+    from ipjax.inference.drawing import draw, gather_evidence, write_image
+
+    rgb = images.rgb
+    rgb = rgb if rgb.dtype == np.uint8 else (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
+    evidence = [gather_evidence(r.templates, r.query, r.crop_estimate, r.info, config) for r in results]
+    picture = draw(rgb, images.camera, [r.estimate for r in results], [r.info for r in results], evidence)
+    target = arguments.overlay
+    if arguments.frames is not None:
+        target.mkdir(parents=True, exist_ok=True)
+        target = target / f"{name}.png"
+    write_image(target, picture)
+    return target
+
+
+def _summary(frame: str, one: dict[str, Any]) -> str:
+    """One line about one object in one frame."""
+    if not one["success"]:
+        return f"{frame}: {one['object']}: no pose found"
+    from ipjax.inference.reports import UNSURE_TURN
+
+    turn = one["ambiguity"]["std_deg"]
+    ending = f"; may be turned (± {turn:.0f}° about one axis)" if turn > UNSURE_TURN else ""
+    if not one["present"]:
+        ending += "; NOT HERE, or not seen well enough: the pose is a guess"
+    x, y, z = (1e3 * v for v in one["camera_from_object"]["translation_m"])
+    size = one["size_mm"]
+    return (
+        f"{frame}: {one['object']}: centre ({x:.0f}, {y:.0f}, {z:.0f}) mm, diameter {size['diameter']:.1f} ± "
+        f"{size['diameter_std']:.1f} mm, {one['inliers']} inliers, confidence {one['confidence']:.2f}{ending}"
+    )

@@ -1,0 +1,130 @@
+"""``ipjax evaluate``: estimate every target of a BOP data set, and score the result."""
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from ipjax.commands.interface import options
+from ipjax.commands.interface.messages import Messages
+from ipjax.commands.interface.parser import add_command
+
+EXAMPLES = """\
+examples:
+  ipjax evaluate ycbv/ -o results/default
+  ipjax evaluate ycbv/ -o results/paper --config paper --against results/default/ipjax-default_ycbv-test.csv
+  ipjax evaluate ycbv/ -o results/four_views --set match.views=4
+  ipjax evaluate ycbv/ -o results/level2 --mesh-quality 2        on meshes made worse; see 'ipjax degrade'
+  ipjax evaluate dexycb/ -o results/mustard --models ycbv/ --only 5 \\
+      --mesh 5=instantmesh_mustard.obj --alignment 5=instantmesh_mustard_to_obj_000005.json
+
+Objects are onboarded from the data set's models/ where that has not been done yet, and kept: in your cache, shared by
+all configurations, or in the folder that --objects names.
+Stop it at any moment and call it again: finished images are not done twice. Results of other settings, or of another
+state of the code, are not continued; --restart begins anew.
+"""
+
+
+def add(commands: Any) -> None:
+    """The command and its options."""
+    parser = add_command(
+        commands,
+        "evaluate",
+        run,
+        "estimate every target of a BOP data set with its annotated masks, and score the result",
+        EXAMPLES,
+    )
+    options.add_dataset(parser)
+    parser.add_argument(
+        "--objects",
+        metavar="auto|FOLDER",
+        default="auto",
+        help="object files named by number (obj_000001.ipjax); missing ones are added (default: the cache)",
+    )
+    options.add_output(parser, "RESULTS", "folder for the results", required=True)
+    parser.add_argument("--only", type=int, nargs="+", metavar="N", help="only these objects")
+    options.add_config(parser)
+    parser.add_argument(
+        "--mesh-quality", type=int, default=0, choices=range(5), help="degrade the models first: 1 … 4 (default 0: not)"
+    )
+    parser.add_argument("--mesh", action="append", metavar="N=FILE", help="a mesh of your own for object N")
+    parser.add_argument(
+        "--alignment", action="append", metavar="N=JSON", help="its similarity to the model: scale, R, t; to score it"
+    )
+    parser.add_argument("--known-size", action="store_true", help="tell the method each object's true diameter")
+    options.add_crop(parser)
+    options.add_scoring(
+        parser, options.METRICS[:5], "all but the last", "count damaged images as misses, instead of stopping"
+    )
+    options.add_views(parser, "new object files")
+    options.add_seed(parser)
+    parser.add_argument("--restart", action="store_true", help="forget what is in the folder of results")
+    options.add_encoder(parser)
+    options.add_reporting(parser, quiet="no progress bar")
+
+
+def run(arguments: argparse.Namespace, messages: Messages) -> int:
+    """Onboard what is missing, estimate, score and show the table; returns the exit status."""
+    options.check_folder(arguments.output)
+    options.check_seed(arguments.seed)
+    if arguments.against is not None and not arguments.against.is_file():
+        raise ValueError(f"{arguments.against}: no such result file")
+    from ipjax.bop import run as studies
+    from ipjax.bop.dataset import Dataset, parse_images
+    from ipjax.bop.evaluation import evaluate
+    from ipjax.config import OnboardConfig
+    from ipjax.inference.compilation_cache import use_compilation_cache
+
+    config = options.read_config(arguments)
+    meshes = studies.parse_numbered(arguments.mesh, "--mesh")
+    alignments = studies.parse_numbered(arguments.alignment, "--alignment")
+    dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
+    encoder = options.load_encoder(arguments)
+    messages.tell()
+    use_compilation_cache()
+    known = studies.prepare(
+        dataset,
+        encoder,
+        folder=None if arguments.objects == "auto" else arguments.objects,
+        objects=arguments.only,
+        config=OnboardConfig(**options.read_views(arguments)),
+        quality=arguments.mesh_quality,
+        seed=arguments.seed,
+        meshes=meshes,
+        alignments=alignments,
+        progress=not arguments.quiet,
+    )
+    finder = studies.Finder(
+        known, encoder, config, crop=arguments.crop, seed=arguments.seed, known_size=arguments.known_size
+    )
+    found = evaluate(
+        dataset,
+        list(known),
+        finder,
+        arguments.output,
+        method=_method(arguments),
+        settings=finder.settings(),
+        alignments=studies.alignments_of(known),
+        on_error="skip" if arguments.skip_bad else "raise",
+        progress=not arguments.quiet,
+        metrics=arguments.metrics,
+        against=arguments.against,
+        without=parse_images(arguments.without),
+        restart="always" if arguments.restart else "never",
+    )
+    messages.say(found.table())
+    for line in finder.refused:
+        messages.say(f"not found: {line}")
+    messages.finish({**found.to_dict(), "not_found": finder.refused})
+    return 0
+
+
+def _method(arguments: argparse.Namespace) -> str:
+    """What the results are called: all that was not the default, in words that a file name may have."""
+    parts = ["ipjax", Path(arguments.config).stem]
+    parts += [re.sub(r"[^\w.]+", "-", change) for change in arguments.changes]
+    if arguments.mesh_quality:
+        parts.append(f"level{arguments.mesh_quality}")
+    if arguments.known_size:
+        parts.append("known-size")
+    return "-".join(parts)
