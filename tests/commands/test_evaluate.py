@@ -21,14 +21,14 @@ SETTINGS = {
 }
 
 
-def start(*words, pause: float = 0.0) -> subprocess.Popen:
+def start(*words, pause: float = 0.0, stderr: int = subprocess.STDOUT) -> subprocess.Popen:
     environment = dict(os.environ, JAX_COMPILATION_CACHE_DIR=str(HERE.parent / "build" / "xla-cache"))
     roots = [str(HERE.parent), str(HERE.parent / "kernels"), *sys.path]
     environment["PYTHONPATH"] = os.pathsep.join(p for p in roots if p)
     return subprocess.Popen(
         [sys.executable, str(HERE / "builders" / "stand_in.py"), str(pause), *map(str, words)],
         stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
+        stderr=stderr,
         text=True,
         env=environment,
     )
@@ -57,9 +57,9 @@ def place(tmp_path_factory) -> Path:
     return folder
 
 
-def evaluate(place: Path, out: str, *more, pause: float = 0.0) -> subprocess.Popen:
+def evaluate(place: Path, out: str, *more, **how) -> subprocess.Popen:
     words = ["ipjax", "evaluate", place / "balls", "--objects", place / "objects", "-o", place / out]
-    return start(*words, "--config", place / "quick.json", "--quiet", *VIEWS, *more, pause=pause)
+    return start(*words, "--config", place / "quick.json", "--quiet", *VIEWS, *more, **how)
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +102,25 @@ def test_killed_at_once_and_run_again_it_gives_the_same_numbers(place, whole):
     images = [json.loads(line)["image"] for line in journal.read_text().splitlines()[1:]]
     assert sorted(images) == [[s, i] for s in range(2) for i in range(3)]  # none twice, none lost
     assert results(place / "killed") == results(place / "whole")
+
+
+def test_a_machine_reads_the_same_score(place, whole):
+    """Finished images are not done twice, so that this takes no time; what is printed elsewhere goes to stderr."""
+    process = evaluate(place, "whole", "--without", "1/0", "--json", stderr=subprocess.PIPE)
+    out, error = process.communicate(timeout=300)
+    assert process.returncode == 0, error
+    told, kept = json.loads(out), json.loads((place / "whole" / "score.json").read_text())
+    assert told["not_found"] == [] and told["all_frames"] == kept["all_frames"]
+    assert "AR_VSD" not in out + error
+
+
+def test_a_changed_setting_is_recorded_by_its_name(place, whole):
+    (journal,) = (place / "whole").glob("results.jsonl")
+    before = journal.read_bytes()
+    process = evaluate(place, "whole", "--set", "match.views=1")
+    out, _ = process.communicate(timeout=300)
+    assert process.returncode == 2 and "settings.config.match.views" in out and "Traceback" not in out
+    assert journal.read_bytes() == before
 
 
 def test_other_settings_are_refused(place, whole):
