@@ -15,6 +15,7 @@ from ipjax.config import PRESETS, Config
 from ipjax.files.storage.parsing import read_json
 
 ConfigT = TypeVar("ConfigT", bound=eqx.Module)
+_MISFIT = object()  # what no field can hold
 _YES, _NO = ("true", "yes", "on"), ("false", "no", "off")
 
 
@@ -98,7 +99,9 @@ def _with(config: Any, path: list[str], whole: str, text: str) -> Any:
         raise ValueError(f"{whole}: {whole.removesuffix('.' + '.'.join(path[1:]))} is one value, not a group")
     else:
         hint = known[path[0]].type
-        new = _checked(_parsed(text, hint), hint, old, whole)
+        new = _fitted(_parsed(text, hint), hint, old)
+        if new is _MISFIT:
+            raise ValueError(f"{whole}: {_expected(hint, old)} is expected, for instance {_told(old)}, not {text!r}")
     return dataclasses.replace(config, **{path[0]: new})
 
 
@@ -150,7 +153,12 @@ def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:
                 raise ValueError(f"{where}: {name} holds settings of its own")
             changed[name] = _replaced(old, value, f"{where}, {name}")
         else:
-            changed[name] = _checked(value, known[name].type, old, f"{where}: {name}")
+            changed[name] = _fitted(value, known[name].type, old)
+            if changed[name] is _MISFIT:
+                raise ValueError(
+                    f"{where}: {name} is {_told(old)} by default; {_told(value)} is of another kind: "
+                    f"{_expected(known[name].type, old)} is expected"
+                )
     return dataclasses.replace(config, **changed)
 
 
@@ -168,8 +176,8 @@ def _number(value: Any) -> float | None:
     return float(value) if abs(value) < 1e300 or value in (math.inf, -math.inf) else None
 
 
-def _checked(value: Any, hint: Any, old: Any, where: str) -> Any:
-    """The value as the field holds it; ValueError says what the field expects."""
+def _fitted(value: Any, hint: Any, old: Any) -> Any:
+    """The value as a field of this type holds it, or `_MISFIT`."""
     for kind in _kinds(hint):
         if typing.get_origin(kind) is tuple:
             numbers = [_number(x) for x in value] if isinstance(value, list) else [None]
@@ -183,14 +191,11 @@ def _checked(value: Any, hint: Any, old: Any, where: str) -> Any:
                 return number
         elif type(value) is kind:
             return value
-    raise ValueError(
-        f"{where} is {_told(describe_config(old))} by default; {_told(value)} is of another kind: "
-        f"{_expected(hint, old)} is expected"
-    )
+    return _MISFIT
 
 
 def _told(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list) else repr(value)
+    return ",".join(map(str, value)) if isinstance(value, tuple | list) else repr(value)
 
 
 def _expected(hint: Any, old: Any) -> str:

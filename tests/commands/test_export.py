@@ -1,5 +1,6 @@
 """``ipjax export``: the artifact, and the settings it was made with, on the screen and beside it."""
 
+import dataclasses
 import json
 
 import pytest
@@ -12,7 +13,8 @@ from ipjax.synthetic import problems
 
 def test_the_settings_are_told(tmp_path, capfd):
     pytest.importorskip("flatbuffers")
-    save(tmp_path / "ball.ipjax", problems.make_templates(), make_object()[1])
+    info = dataclasses.replace(make_object()[1], pictures=None, resolution=112)
+    save(tmp_path / "ball.ipjax", problems.make_templates(), info)
     out = tmp_path / "quick.stablehlo"
     words = ["export", tmp_path / "ball.ipjax", "-o", out, "--config", "paper", "--set", "align.count=32"]
     assert run([*map(str, words), "--json"]) == 0
