@@ -157,7 +157,8 @@ def _from_photo(arguments: argparse.Namespace, config: Any) -> tuple[Any, Any, A
 
         given["mask"] = read_mask(arguments.mask, arguments.mask_label)
     given["tried"] = arguments.output.with_suffix(".tried.png")
-    prepare_photo(arguments.source, **given)  # a bad photo is refused before weights are loaded and anything is compiled
+    # A bad photo is refused before weights are loaded and anything is compiled.
+    prepare_photo(arguments.source, **given)
     encoder = options.load_encoder(arguments)
     use_compilation_cache()
     lrm = {"lrm": arguments.lrm or "auto", "lrm_weights": arguments.lrm_weights}

@@ -8,7 +8,7 @@ from builders.command_lines import run
 
 from ipjax.commands.demo_scene import compare
 from ipjax.records import Similarity
-from ipjax.synthetic.scenes import make_object
+from ipjax.synthetic.objects import make_object
 
 
 def test_a_comparison_tells_what_was_changed():
@@ -18,9 +18,9 @@ def test_a_comparison_tells_what_was_changed():
     assert same.good and same.add < 1e-6 and same.rotation < 0.1 and same.translation == 0
     angle = np.radians(30)
     turn = jnp.asarray([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]], jnp.float32)
-    moved = Similarity(turn, true.translation + jnp.asarray([0.03, 0.0, 0.0]), jnp.asarray(0.25))
+    moved = Similarity(turn, true.translation + jnp.asarray([0.06, 0.0, 0.0]), jnp.asarray(0.25))
     found = compare(moved, true, mesh)
-    assert found.rotation == pytest.approx(30, abs=0.1) and found.translation == pytest.approx(0.03, rel=1e-5)
+    assert found.rotation == pytest.approx(30, abs=0.1) and found.translation == pytest.approx(0.06, rel=1e-5)
     assert (found.true_size, found.size) == (pytest.approx(0.2), pytest.approx(0.25))
     assert not found.good and found.adds <= found.add
     assert all(np.isfinite(x) for x in jax.tree.leaves(vars(found)))
