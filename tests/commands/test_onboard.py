@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import trimesh
 from builders.command_lines import run
+from builders.tiny_dinov2 import tiny
 from flax import nnx
-from test_dinov2 import tiny
 
 from ipjax.files.objects.loading import load
 from ipjax.networks.dinov2 import DinoV2, Encoder

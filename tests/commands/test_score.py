@@ -2,7 +2,7 @@
 
 import json
 
-from bop_roots import write_images
+from builders.bop_roots import write_images
 from builders.command_lines import run
 
 from ipjax.bop.dataset import HEADER

@@ -6,8 +6,8 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.estimates import make_estimate
 from builders.objects import make_object
-from estimates import make_estimate
 
 from ipjax.inference.reports import tell_estimate, to_json
 from ipjax.records import PoseEstimate, Similarity
