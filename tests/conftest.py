@@ -47,3 +47,15 @@ def weights_cache(tmp_path, monkeypatch) -> Path:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("IPJAX_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache" / "weights"
+
+
+@pytest.fixture
+def case(tmp_path, monkeypatch) -> Path:
+    """A folder with every input of a frame for the command, all of them well-formed; nothing is kept beyond it."""
+    from builders.command_lines import write_case
+
+    monkeypatch.setenv("IPJAX_NO_CACHE", "1")
+    monkeypatch.setenv("IPJAX_CACHE", str(tmp_path / "cache"))
+    monkeypatch.delenv("IPJAX_DEBUG", raising=False)
+    write_case(tmp_path)
+    return tmp_path
