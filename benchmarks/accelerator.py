@@ -20,7 +20,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,12 +57,12 @@ NOISE = 0.3  # of the answers' features, whose norm is 1
 class Session:
     """What the parts share: sizes, the object, and where answers are."""
 
-    def __init__(self, quick: bool, answers: Path | None, weights: str | None, trace: Path | None):
+    def __init__(self, quick: bool, answers: Path | None, weights: str | None, trace: Path | None, batches=()):
         self.quick, self.answers, self.weights, self.trace = quick, answers, weights, trace
         self.grid, self.channels = (8, 32) if quick else (16, 384)
         self.seconds = 0.2 if quick else 1.0
-        self.batches = (2,) if quick else BATCHES
-        self.staged = 2 if quick else STAGED
+        self.batches = batches or ((2,) if quick else BATCHES)
+        self.staged = min(STAGED, max(self.batches))
         with jax.default_device(jax.devices("cpu")[0]):
             views = (8, 1) if quick else (40, 10)
             templates = problems.make_templates(*views, grid=self.grid, channels=self.channels)
@@ -79,13 +79,12 @@ class Session:
         # Made on the processor: thousands of tiny programs are nothing for an accelerator.
         on_host = jax.tree.map(np.asarray, (self.templates, self.encoder))
         self.templates, self.encoder = jax.tree.map(jnp.asarray, on_host)
-        self.pool, self.jobs = ThreadPoolExecutor(os.cpu_count()), []
 
-    def compile(self, forms: "Forms") -> dict[Any, Future]:
-        """Trace every function, and have it compiled by threads, as many as there are processors.
+    def compile(self, forms: "Forms") -> dict[Any, tuple[Callable, float, int]]:
+        """Every function compiled, by threads, as many as there are processors; nothing is compiled any more then.
 
-        Each result is the compiled function, the seconds of its own tracing and compiling, beside the others', and the
-        bytes of its temporary arrays.
+        Each is the compiled function, the seconds of its own tracing and compiling, beside the others', and the bytes
+        of its temporary arrays.
         """
 
         def build(lowered, seconds):
@@ -95,18 +94,14 @@ class Session:
             memory = compiled.memory_analysis()
             return compiled, seconds, int(memory.temp_size_in_bytes) if memory is not None else -1
 
-        found = {}
-        for key, (function, arguments) in forms.items():
-            start = time.perf_counter()
-            # A function of its own: what was compiled before is found again otherwise.
-            lowered = jax.jit(lambda *a, function=function: function(*a)).lower(*arguments)
-            found[key] = self.pool.submit(build, lowered, time.perf_counter() - start)
-        self.jobs += found.values()
-        return found
-
-    def wait(self) -> None:
-        """Until nothing is compiled any more, so that times are of the device alone."""
-        wait(self.jobs)
+        jobs = {}
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for key, (function, arguments) in forms.items():
+                start = time.perf_counter()
+                # A function of its own: what was compiled before is found again otherwise.
+                lowered = jax.jit(lambda *a, function=function: function(*a)).lower(*arguments)
+                jobs[key] = pool.submit(build, lowered, time.perf_counter() - start)
+        return {key: job.result() for key, job in jobs.items()}
 
     def load_dinov2(self, dtype: str) -> Encoder:
         """The encoder of the given weights, or of random ones."""
@@ -134,37 +129,35 @@ def answers(session: Session) -> Iterator[dict[str, Any]]:
     calls = [(*arguments[:2], take(session.queries, i), keys[i], Config()) for i in range(len(keys))]
     single, seconds, temporary = compile_fresh(estimate, *calls[0])
     yield {"what": "estimate, compiled alone", "seconds": seconds, "temporary_bytes": temporary}
-    job = session.compile({"all": (jax.vmap(estimate, MAPPED), arguments)})["all"]
-    yield READY
     found = jax.tree.map(lambda *x: np.stack(x), *[single(*call) for call in calls])
     again = single(*calls[0])
     same = all(np.array_equal(x[0], y) for x, y in zip(*map(jax.tree.leaves, (found, again)), strict=True))
     yield {"what": "the same call once more", "identical": same}
     yield {"what": "estimate"} | time_call(lambda: single(*calls[0]), session.seconds, 1)
-    together = job.result()[0](*arguments)
-    poses = {"one by one": found, "all at once": together, "truth": truth}
-    poses = {name: getattr(pose, "camera_from_object", pose) for name, pose in poses.items()}
-    confidence = {"one by one": found.confidence, "all at once": together.confidence}
+    confidence = {"one by one": found.confidence}
+    poses = {"one by one": found.camera_from_object, "truth": truth}
     if session.answers and session.answers.exists():
         with np.load(session.answers, allow_pickle=False) as file:
             if "rotation" in file:
-                poses["the file's"] = dataclasses.replace(
-                    truth, **{k: file[k] for k in ("rotation", "translation", "scale")}
-                )
+                poses["the file's"] = dataclasses.replace(truth, **{name: file[name] for name in POSE})
                 confidence["the file's"] = file["confidence"]
                 yield {"what": f"the file's answers are of {file['made']}"}
     elif session.answers:
-        one = poses["one by one"]
-        keep(session.answers, rotation=one.rotation, translation=one.translation, scale=one.scale)
-        keep(session.answers, confidence=found.confidence)
-    for name in poses:
-        for other in ("truth", "one by one", "the file's"):
-            if other in poses and (name, other) in PAIRS:
-                yield {
-                    "what": f"{name}, from {other}",
-                    **differences(poses[name], poses[other], confidence, name, other),
-                }
+        arrays = {name: getattr(found.camera_from_object, name) for name in POSE}
+        keep(session.answers, confidence=found.confidence, **arrays)
+
+    def compare(*names: str) -> Iterator[dict[str, Any]]:
+        for name, other in PAIRS:
+            if name in poses and other in poses and name in names:
+                differ = differences(poses[name], poses[other], confidence, name, other)
+                yield {"what": f"{name}, from {other}", **differ}
+
+    yield from compare("one by one", "the file's")
     yield from features(session, session.queries.view.rgb[:4])
+    function, *_ = compile_fresh(jax.vmap(estimate, MAPPED), *arguments)
+    together = function(*arguments)
+    poses["all at once"], confidence["all at once"] = together.camera_from_object, together.confidence
+    yield from compare("all at once")
 
 
 def features(session: Session, images) -> Iterator[dict[str, Any]]:
@@ -186,9 +179,14 @@ def features(session: Session, images) -> Iterator[dict[str, Any]]:
             yield {"what": f"features in {name}, from {other}", "error": error, "least_cosine": least}
 
 
-READY: dict[str, Any] = {}  # what a part yields when all that it needs is being compiled
+POSE = ("rotation", "translation", "scale")
+PAIRS = [
+    ("one by one", "truth"),
+    ("the file's", "truth"),
+    ("one by one", "the file's"),
+    ("all at once", "one by one"),
+]
 MAPPED = (None, None, 0, 0, None)
-PAIRS = {("one by one", "truth"), ("the file's", "truth"), ("all at once", "one by one"), ("one by one", "the file's")}
 
 
 def take(tree, index: int):
@@ -293,34 +291,28 @@ def encoders(session: Session) -> Iterator[dict[str, Any]]:
 
 
 def time_forms(session: Session, forms: Forms) -> Iterator[dict[str, Any]]:
-    """A row of each, by its name and the number of its queries."""
-    jobs = session.compile(forms)
-    yield READY
-    for (name, batch), job in jobs.items():
-        compiled, seconds, temporary = job.result()
-        row = {"what": name, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
-        yield row | time_call(partial(compiled, *forms[name, batch][1]), session.seconds, batch)
+    """A row of each, by its name and the number of its queries; those of one number are compiled together."""
+    for many in sorted({batch for _, batch in forms}):
+        group = {key: form for key, form in forms.items() if key[1] == many}
+        for (name, batch), (compiled, seconds, temporary) in session.compile(group).items():
+            row = {"what": name, "batch": batch, "compile_s": seconds, "temporary_bytes": temporary}
+            yield row | time_call(partial(compiled, *forms[name, batch][1]), session.seconds, batch)
 
 
 def searches(session: Session) -> Iterator[dict[str, Any]]:
     """The kernel's forms; GFLOP/s count the product of all patches."""
     sizes = [(5, 64, 32, "bfloat16")] if session.quick else SIZES
-    jobs = {}
-    for size in sizes:
-        arguments, dtype = neighbours.problem(*size[:3]), size[3]
+    for views, patches, channels, dtype in sizes:
+        arguments, found, base = neighbours.problem(views, patches, channels), {}, 1.0
+        where = {"size": f"{views} × {patches}² × {channels}", "dtype": dtype}
         forms = {
             "nearest (xla)": partial(nearest, dtype=dtype, compact=False),
             "one large product": partial(neighbours.large_product, dtype=dtype),
         }
         if dtype == "bfloat16":
             forms["nearest (pallas)"] = partial(nearest, dtype=dtype, implementation="pallas")
-        jobs[size] = session.compile({name: (form, arguments) for name, form in forms.items()})
-    yield READY
-    for views, patches, channels, dtype in sizes:
-        arguments, found, base = neighbours.problem(views, patches, channels), {}, 1.0
-        where = {"size": f"{views} × {patches}² × {channels}", "dtype": dtype}
-        for name, job in jobs[views, patches, channels, dtype].items():
-            compiled, seconds, temporary = job.result()
+        built = session.compile({name: (form, arguments) for name, form in forms.items()})
+        for name, (compiled, seconds, temporary) in built.items():
             call = partial(compiled, *arguments)
             row = {"what": name, **where, "compile_s": seconds, "temporary_bytes": temporary}
             row |= time_call(call, session.seconds / 4, 1)
@@ -401,7 +393,8 @@ def render(results: dict[str, Any]) -> str:
         + (" — quick run, small sizes" if results["quick"] else ""),
         "",
         f"Measured by `{results['command']}`, in {results['seconds']:.0f} s. "
-        "Forms of one part were compiled in parallel; the seconds of compiling are of each beside the others. "
+        "Forms of one part and one number of queries were compiled in parallel; the seconds of compiling are of each "
+        "beside the others. "
         "“One by one” is the median of calls each of which is waited for, “in a row” the mean of calls of which only "
         "the last is.",
     ]
@@ -417,7 +410,7 @@ def render(results: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measure, print as it goes, and write what was asked for after every part."""
+    """Measure, print as it goes, and write what was asked for after every row: a run cut short keeps its rows."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.accelerator",
         description=__doc__,
@@ -429,6 +422,7 @@ def main() -> None:
     parser.add_argument("--answers", type=Path, metavar="FILE", help="npz: write answers here, or compare with those")
     parser.add_argument("--weights", help="of the encoder (default: random ones)")
     parser.add_argument("--trace", type=Path, metavar="FOLDER", help="write a profile of two estimates here")
+    parser.add_argument("--batches", type=int, nargs="+", help="queries at once (default: 8 32 128)")
     parser.add_argument("--commit", help="what to call the code where there is no git (default: ask git)")
     parser.add_argument("--quick", action="store_true", help="small sizes, few runs: does it work?")
     options = parser.parse_args()
@@ -441,33 +435,22 @@ def main() -> None:
     flags = f"XLA_FLAGS={os.environ['XLA_FLAGS']} " if os.environ.get("XLA_FLAGS") else ""
     given = " --answers FILE" * bool(options.answers) + " --weights FILE" * bool(options.weights)
     results["command"] = f"{flags}python -m benchmarks.accelerator{only}{given}"
-    session = Session(options.quick, options.answers, options.weights, options.trace)
+    session = Session(options.quick, options.answers, options.weights, options.trace, options.batches)
     print(
         f"{results['device']}, jax {results['jax']}; problems made in {time.perf_counter() - begin:.0f} s", flush=True
     )
-    chosen = [part for part in PARTS if part in (options.only or PARTS)]
-    running = {part: RUN[part](session) for part in chosen}
-
-    def advance(part: str, rows: Iterator[dict[str, Any]]) -> None:
-        for row in rows:
-            if row is READY:
-                return
+    for part in PARTS:
+        if part not in (options.only or PARTS):
+            continue
+        for row in RUN[part](session):
             results["parts"].setdefault(part, []).append(row)
+            results["seconds"] = time.perf_counter() - begin
             told = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items() if k != "what"}
-            print(f"[{time.perf_counter() - begin:4.0f} s] {part}: {row['what']}: {told}", flush=True)
-        results["seconds"] = time.perf_counter() - begin
-        if options.json:
-            write_text(options.json, json.dumps(results, indent=1, ensure_ascii=False) + "\n", parents=True)
-        if options.page:
-            write_text(options.page, render(results), parents=True)
-
-    for part, rows in running.items():
-        advance(part, rows)
-        print(f"[{time.perf_counter() - begin:4.0f} s] {part}: traced", flush=True)
-    session.wait()
-    print(f"[{time.perf_counter() - begin:4.0f} s] everything is compiled", flush=True)
-    for part, rows in running.items():
-        advance(part, rows)
+            print(f"[{results['seconds']:4.0f} s] {part}: {row['what']}: {told}", flush=True)
+            if options.json:
+                write_text(options.json, json.dumps(results, indent=1, ensure_ascii=False) + "\n", parents=True)
+            if options.page:
+                write_text(options.page, render(results), parents=True)
     print("\n" + render(results))
 
 
