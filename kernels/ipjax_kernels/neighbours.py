@@ -50,7 +50,7 @@ def nearest(
     and share that memory. ``dtype`` is what the features are rounded to before the product, template by template;
     sums are float32 always. ``implementation``: "xla" runs anywhere and can be exported; "pallas" is one fused kernel
     on Hopper GPUs (compute capability 9.0), for bfloat16, which keeps similarities out of memory altogether, and
-    "xla" on all other devices. It has been compiled for a GPU but never run on one: see kernels/README.md.
+    "xla" on all other devices. On an H200 it takes 0.4 to 0.5 of the time of "xla": kernels/README.md.
     ``compact`` ("xla" only) multiplies the valid patches of the query and few others: one of five sizes, chosen at
     run time, so nothing is ever left out. The templates' invalid patches are the caller's to leave out, once.
 

@@ -135,7 +135,7 @@ def test_laws(seed):
     np.testing.assert_allclose(mine.score, theirs.score, atol=1e-4)
     # The target's frame and unit do not matter.
     turn = jnp.asarray([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    moved = solve(source, 4 * target @ turn.T, weight, sets=table)
+    moved = solve(source, jnp.matmul(4 * target, turn.T, precision="highest"), weight, sets=table)
     np.testing.assert_allclose(moved.score[0], mine.score[0], atol=1e-4)
     np.testing.assert_allclose(moved.scale[0], 4 * mine.scale[0], rtol=1e-3)
 
