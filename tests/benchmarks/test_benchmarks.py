@@ -96,6 +96,20 @@ def test_a_quick_run_writes_its_rows(tmp_path):
     assert "| umeyama |" in done.stdout and "s in all" in done.stdout
 
 
+def test_the_page_of_an_accelerator_has_the_forms_of_the_kernel(tmp_path):
+    page, path = tmp_path / "page.md", tmp_path / "rows.json"
+    command = [sys.executable, "-m", "benchmarks.accelerator", "--quick", "--only", "neighbours"]
+    command += ["--page", str(page), "--json", str(path)]
+    subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=True)
+    rows = json.loads(path.read_text())["parts"]["neighbours"]
+    timed = {row["what"]: row for row in rows if "median_ms" in row}
+    assert set(timed) == {"nearest (xla)", "one large product", "nearest (pallas)"}
+    assert all(row["in_a_row_ms"] > 0 and row["compile_s"] > 0 for row in timed.values())
+    assert [row["indices_differ"] for row in rows if "indices_differ" in row] == [0, 0]
+    text = page.read_text()
+    assert "## Nearest neighbours" in text and text.count("| nearest (pallas) |") == 1
+
+
 def test_the_ablation_goes_from_the_paper_to_the_default(tmp_path):
     steps = []
     for name, changes in ablation.STEPS.items():
