@@ -9,8 +9,9 @@ from typing import Literal
 import equinox as eqx
 
 
-def _static(default):
-    return eqx.field(static=True, default=default)
+def _static(default, least: int = 0):
+    """A field that fixes a shape or picks a code path; a whole number is at least ``least``."""
+    return eqx.field(static=True, default=default, metadata={"least": least})
 
 
 class DescribeConfig(eqx.Module):
@@ -25,20 +26,22 @@ class MatchConfig(eqx.Module):
 
     ranking: Literal["cyclic", "cosine"] = _static("cosine")  # views by Eq. 5, or by the cosines of short cycles
     centred: bool = _static(True)  # compare features without the object's mean feature; the paper does not
-    views: int = _static(8)  # templates whose pairs are kept
-    pairs: int = _static(256)  # most pairs of each (the paper's K)
+    views: int = _static(8, least=1)  # templates whose pairs are kept
+    pairs: int = _static(256, least=3)  # most pairs of each (the paper's K)
     cycle: float = 1.5  # longest cycle of a pair, patches; inf in the paper
-    memory_bytes: int = _static(64 * 2**20)  # bound on the similarities held at once
-    shortlist: int | None = _static(None)  # templates searched patch by patch, the likeliest by pooled features; all
+    memory_bytes: int = _static(64 * 2**20, least=1)  # bound on the similarities held at once
+    shortlist: int | None = _static(
+        None, least=1
+    )  # templates searched patch by patch, the likeliest by pooled features; all
 
 
 class AlignConfig(eqx.Module):
     """From pairs to similarities (Algorithm 1, corrected)."""
 
-    count: int = _static(1024)  # minimal sets per view
-    size: int = _static(3)  # pairs in one
+    count: int = _static(1024, least=1)  # minimal sets per view
+    size: int = _static(3, least=3)  # pairs in one
     rank: Literal["msac", "count"] = _static("msac")
-    keep: int = _static(1)  # hypotheses kept per view
+    keep: int = _static(1, least=1)  # hypotheses kept per view
     refits: int = _static(3)
     threshold: float = 0.08  # residual of an inlier, in diameters: about one patch
     scale_gate: tuple[float, float] = (0.5, 2.0)  # around the size seen in the mask and depth
@@ -49,7 +52,7 @@ class RefineConfig(eqx.Module):
     """From a coarse similarity to one that fits the depth image."""
 
     steps: int = _static(12)  # of Levenberg and Marquardt; 0 = no refinement, as in the paper
-    points: int = _static(256)  # surface points per direction of the association
+    points: int = _static(256, least=1)  # surface points per direction of the association
     reach: float = 0.06  # associations farther than this are dropped, in diameters
     width: float = 0.03  # of the robust loss, in diameters
     silhouette: int = _static(96)  # points on the mask's border that the silhouette is fitted to
@@ -69,7 +72,7 @@ class ScoreConfig(eqx.Module):
     """Which hypothesis explains the query best."""
 
     ranking: Literal["inliers", "render"] = _static("render")
-    resolution: int = _static(56)  # pixels on a side of the depth comparison
+    resolution: int = _static(56, least=1)  # pixels on a side of the depth comparison
     views: int = _static(5)  # templates that lend a hypothesis their features
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
     power: float = 2.0  # of the agreement with the templates' features; that of the object drawn has 1
@@ -147,12 +150,12 @@ PRESETS = ("default", "fast", "paper")
 class OnboardConfig(eqx.Module):
     """From a mesh to templates."""
 
-    directions: int = _static(40)  # viewpoints on the Fibonacci sphere
-    rolls: int = _static(10)  # in-plane rotations of each; 40 × 10 is the paper's 400
-    resolution: int = _static(224)  # pixels on a side
+    directions: int = _static(40, least=1)  # viewpoints on the Fibonacci sphere
+    rolls: int = _static(10, least=1)  # in-plane rotations of each; 40 × 10 is the paper's 400
+    resolution: int = _static(224, least=1)  # pixels on a side
     fill: float = _static(0.83)  # share of the image that the object's box takes: 20 % of padding around it
     distance: float = _static(3.0)  # diameters from the camera to the object's centre
-    surface: int = _static(2048)  # points sampled on the surface
+    surface: int = _static(2048, least=1)  # points sampled on the surface
     channels: int = _static(0)  # principal directions that features are cut to; 0 = whole features
     appearance: int = _static(65536)  # coloured points to draw candidates from; 0 = none
     describe: DescribeConfig = DescribeConfig()

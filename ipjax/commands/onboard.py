@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.config import OnboardConfig
 
     start = time.perf_counter()
-    config = options.change(OnboardConfig(**options.read_views(arguments, "channels")), arguments)
+    config = options.change(arguments, OnboardConfig(**options.read_views(arguments, "channels")))
     make = _from_photo if is_photo else _from_mesh
     templates, info, encoder, photo = make(arguments, config)
     warned: tuple[str, ...] = ()

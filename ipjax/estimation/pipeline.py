@@ -217,6 +217,8 @@ class SceneGrid(eqx.Module):
 
     def __init__(self, query: Query, grid: int, contour: int):
         view, side = query.view, query.view.depth.shape[0]
+        if side % grid:
+            raise ValueError(f"score.resolution must divide the {side} pixels of a crop's side; {grid} does not")
         camera = resize(view.camera, (side, side), (grid, grid))
         covered = jnp.mean(view.mask.astype(view.depth.dtype).reshape(grid, side // grid, grid, -1), axis=(1, 3))
         self.mask = mostly(covered)

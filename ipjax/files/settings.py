@@ -26,7 +26,7 @@ def read_config(name: str | Path, changes: Iterable[str] = ()) -> Config:
     Raises ValueError, in a sentence, for a setting that does not exist or is of the wrong kind.
     """
     if str(name) in PRESETS:
-        return override(Config.named(str(name)), changes)
+        return override(changes, Config.named(str(name)))
     path = Path(name)
     if not path.is_file():
         raise ValueError(f"{name}: neither {', '.join(PRESETS)} nor a file of settings")
@@ -36,16 +36,16 @@ def read_config(name: str | Path, changes: Iterable[str] = ()) -> Config:
     start = entry.pop("from", "default")
     if start not in PRESETS:
         raise ValueError(f"{path}: 'from' is one of {', '.join(PRESETS)}, not {start!r}")
-    return override(_replaced(Config.named(start), entry, str(path)), changes)
+    return override(changes, _replaced(Config.named(start), entry, str(path)))
 
 
-def override(config: ConfigT, changes: Iterable[str]) -> ConfigT:
+def override(changes: Iterable[str], config: ConfigT) -> ConfigT:
     """A configuration with some fields changed, each named by its path: ``match.views=4``, ``align.scale_gate=0.5,2``.
 
     Args:
-        config: any of the configurations.
         changes: ``FIELD=VALUE``; of two of the same field the last counts. ``true`` and ``false``, ``none`` where a
             field may be absent, ``inf``, and commas between the numbers of a list.
+        config: any of the configurations.
 
     Raises:
         ValueError: there is no such field (the message names those that are spelled alike), or the value is of another
@@ -60,12 +60,12 @@ def override(config: ConfigT, changes: Iterable[str]) -> ConfigT:
     return config
 
 
-def list_fields(config: eqx.Module, before: str = "") -> Iterator[tuple[str, Any]]:
+def list_fields(config: eqx.Module, *, before: str = "") -> Iterator[tuple[str, Any]]:
     """The path of every field of a configuration, such as ``match.views``, and its value."""
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if isinstance(value, eqx.Module):
-            yield from list_fields(value, f"{before}{field.name}.")
+            yield from list_fields(value, before=f"{before}{field.name}.")
         else:
             yield f"{before}{field.name}", value
 
@@ -98,10 +98,10 @@ def _with(config: Any, path: list[str], whole: str, text: str) -> Any:
     elif len(path) > 1:
         raise ValueError(f"{whole}: {whole.removesuffix('.' + '.'.join(path[1:]))} is one value, not a group")
     else:
-        hint = known[path[0]].type
-        new = _fitted(_parsed(text, hint), hint, old)
+        field = known[path[0]]
+        new = _fitted(_parsed(text, field.type), field, old)
         if new is _MISFIT:
-            raise ValueError(f"{whole}: {_expected(hint, old)} is expected, for instance {_told(old)}, not {text!r}")
+            raise ValueError(f"{whole}: {_expected(field, old)} is expected, for instance {_told(old)}, not {text!r}")
     return dataclasses.replace(config, **{path[0]: new})
 
 
@@ -153,11 +153,11 @@ def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:
                 raise ValueError(f"{where}: {name} holds settings of its own")
             changed[name] = _replaced(old, value, f"{where}, {name}")
         else:
-            changed[name] = _fitted(value, known[name].type, old)
+            changed[name] = _fitted(value, known[name], old)
             if changed[name] is _MISFIT:
                 raise ValueError(
                     f"{where}: {name} is {_told(old)} by default; {_told(value)} is of another kind: "
-                    f"{_expected(known[name].type, old)} is expected"
+                    f"{_expected(known[name], old)} is expected"
                 )
     return dataclasses.replace(config, **changed)
 
@@ -176,9 +176,9 @@ def _number(value: Any) -> float | None:
     return float(value) if abs(value) < 1e300 or value in (math.inf, -math.inf) else None
 
 
-def _fitted(value: Any, hint: Any, old: Any) -> Any:
-    """The value as a field of this type holds it, or `_MISFIT`."""
-    for kind in _kinds(hint):
+def _fitted(value: Any, field: dataclasses.Field, old: Any) -> Any:
+    """The value as this field holds it, or `_MISFIT`."""
+    for kind in _kinds(field.type):
         if typing.get_origin(kind) is tuple:
             numbers = [_number(x) for x in value] if isinstance(value, list) else [None]
             if len(numbers) == len(old) and None not in numbers:
@@ -189,6 +189,9 @@ def _fitted(value: Any, hint: Any, old: Any) -> Any:
         elif kind is float:
             if (number := _number(value)) is not None:
                 return number
+        elif kind is int:
+            if isinstance(value, int) and not isinstance(value, bool) and value >= _least(field):
+                return value
         elif type(value) is kind:
             return value
     return _MISFIT
@@ -198,10 +201,15 @@ def _told(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, tuple | list) else repr(value)
 
 
-def _expected(hint: Any, old: Any) -> str:
-    names = {bool: "true or false", int: "a whole number", float: "a number", type(None): "none"}
+def _least(field: dataclasses.Field) -> int:
+    """The smallest whole number that the field takes."""
+    return field.metadata.get("least", 0)
+
+
+def _expected(field: dataclasses.Field, old: Any) -> str:
+    names = {bool: "true or false", int: f"a whole number from {_least(field)}", float: "a number", type(None): "none"}
     told = []
-    for kind in _kinds(hint):
+    for kind in _kinds(field.type):
         if typing.get_origin(kind) is tuple:
             told.append(f"a list of {len(old)} numbers")
         elif typing.get_origin(kind) is typing.Literal:

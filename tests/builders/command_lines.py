@@ -28,7 +28,8 @@ def write_case(folder: Path) -> None:
 def estimate_words(folder, *more, **replace) -> list[str]:
     """``ipjax estimate`` on the folder of the fixture `case`; ``replace``: another file for an option, or None.
 
-    ``more`` comes last."""
+    ``more`` comes last.
+    """
     given = {"rgb": "rgb.png", "depth": "depth.png", "camera": "camera.json", "mask": "mask.png"} | replace
     words = ["estimate", str(folder / given.pop("object", "mug.ipjax")), "-o", str(folder / "out.json")]
     for name, value in given.items():

@@ -56,4 +56,6 @@ def test_a_mesh_becomes_an_object_file(case, capfd, monkeypatch):
     assert info.config["resolution"] == 56 and info.config["describe"]["cover"] == 0.3
     assert templates.surface.points.shape == (256, 3)
     assert run([*map(str, words), "--set", "resolution=large"]) == 2
-    assert "--set: resolution: a whole number is expected, for instance 56, not 'large'" in capfd.readouterr().err
+    assert (
+        "--set: resolution: a whole number from 1 is expected, for instance 56, not 'large'" in capfd.readouterr().err
+    )

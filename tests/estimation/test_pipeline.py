@@ -247,6 +247,14 @@ def test_what_does_not_fit_is_said(templates, change, message):
         config.update("jaxtyping_disable", False)
 
 
+@pytest.mark.parametrize("grid", [30, 1000])
+def test_a_grid_that_does_not_divide_the_crop_is_said(templates, grid):
+    query, _ = problems.make_query(0)
+    config = dataclasses.replace(TINY, score=ScoreConfig(resolution=grid, alternates=0))
+    with pytest.raises(ValueError, match=f"score.resolution must divide the 112 pixels .* {grid} does not"):
+        jax.eval_shape(ipjax.estimate, None, templates, query, jax.random.key(0), config)
+
+
 def test_compacted_templates_give_the_same_answer(templates):
     """Background is left out of the templates, and of nothing that is told."""
     small = ipjax.compact(templates, multiple=8)

@@ -24,6 +24,7 @@ def test_settings_from_a_file(tmp_path):
         ('{"match": 4}', "match holds settings of its own"),
         ('{"match": {"views": "many"}}', "views is 8 by default"),
         ('{"align": {"count": true}}', "of another kind"),
+        ('{"align": {"size": 2}}', "a whole number from 3 is expected"),
         ('{"match": {"cycle": 1%s}}' % ("0" * 400), "a number is expected"),
         ('{"from": "nowhere"}', "'from' is one of default, fast, paper, not 'nowhere'"),
         ("[1]", "a JSON object"),
@@ -64,8 +65,8 @@ def test_any_field_is_changed_by_its_path():
     assert (config.match.views, config.match.cycle, config.match.shortlist) == (6, 2.0, 100)
     assert (config.match.ranking, config.match.centred, config.refine.settle) == ("cyclic", False, False)
     assert config.align.scale_gate == (0.25, float("inf"))
-    assert override(config, ["match.shortlist=none"]).match.shortlist is None
-    assert override(OnboardConfig(), ["directions=7", "describe.cover=0.5"]).describe.cover == 0.5
+    assert override(["match.shortlist=none"], config).match.shortlist is None
+    assert override(["directions=7", "describe.cover=0.5"], OnboardConfig()).describe.cover == 0.5
     assert read_config("fast", ["match.views=6"]) == Config.fast()
 
 
@@ -73,7 +74,7 @@ def test_every_field_takes_the_value_that_it_has():
     for config in (Config(), Config.paper(), OnboardConfig()):
         for name, value in list_fields(config):
             text = ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
-            assert override(config, [f"{name}={text}"]) == config, name
+            assert override([f"{name}={text}"], config) == config, name
 
 
 @pytest.mark.parametrize(
@@ -91,17 +92,19 @@ def test_every_field_takes_the_value_that_it_has():
         ("match.views", "give FIELD=VALUE, for instance match.views=8"),
         ("=4", "give FIELD=VALUE"),
         ("match.views=", "give FIELD=VALUE"),
-        ("match.views=four", "match.views: a whole number is expected, for instance 8, not 'four'"),
-        ("match.views=4.5", "a whole number is expected"),
+        ("match.views=four", "match.views: a whole number from 1 is expected, for instance 8, not 'four'"),
+        ("match.views=4.5", "a whole number from 1 is expected"),
+        ("match.views=0", "match.views: a whole number from 1 is expected, for instance 8, not '0'"),
+        ("refine.steps=-1", "a whole number from 0 is expected"),
         ("match.cycle=long", "match.cycle: a number is expected, for instance 1.5, not 'long'"),
         ("match.cycle=nan", "a number is expected"),
         ("match.centred=2", "true or false is expected"),
         ("match.ranking=best", "'cyclic' or 'cosine' is expected"),
-        ("match.shortlist=few", "a whole number or none is expected"),
+        ("match.shortlist=few", "a whole number from 1 or none is expected"),
         ("align.scale_gate=0.5", "align.scale_gate: a list of 2 numbers is expected, for instance 0.5,2.0, not '0.5'"),
         ("align.scale_gate=0.5,big", "a list of 2 numbers is expected"),
     ],
 )
 def test_a_change_that_cannot_be_made_is_told_what_can(change, says):
     with pytest.raises(ValueError, match=re.escape(says)):
-        override(Config(), [change])
+        override([change], Config())

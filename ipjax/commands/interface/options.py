@@ -84,15 +84,15 @@ def read_config(arguments: argparse.Namespace) -> Any:
     """What ``--config`` and ``--set`` say; ValueError, in words, where there is no such setting."""
     from ipjax.files.settings import read_config
 
-    return change(read_config(arguments.config), arguments)
+    return change(arguments, read_config(arguments.config))
 
 
-def change(config: Any, arguments: argparse.Namespace) -> Any:
+def change(arguments: argparse.Namespace, config: Any) -> Any:
     """A configuration with what ``--set`` changes; ValueError, in words, where there is no such setting."""
     from ipjax.files.settings import override
 
     try:
-        return override(config, arguments.changes)
+        return override(arguments.changes, config)
     except ValueError as error:
         raise ValueError(f"--set: {error}") from None
 
