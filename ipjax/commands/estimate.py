@@ -159,7 +159,7 @@ def _estimate_frame(
     files: FrameFiles, images: Images | None, estimator: Any, arguments: argparse.Namespace, messages: Messages
 ) -> dict[str, Any]:
     """What is told of one frame; its picture is drawn. ``images``: where it has been read already."""
-    from ipjax.inference.reports import tell_estimate
+    from ipjax.inference.reports import estimate_as_json
 
     warned = len(messages.warnings)
     if images is None:
@@ -183,7 +183,7 @@ def _estimate_frame(
             {
                 "object_file": str(arguments.objects[i]),
                 "mask": None if files.masks[i] is None else str(files.masks[i]),
-                **tell_estimate(result.estimate, result.templates, result.info),
+                **estimate_as_json(result.estimate, result.templates, result.info),
                 "size_given_mm": None if diameter is None else 1e3 * diameter,
                 "stage_seconds": {
                     name: round(value, 6) for name, value in ({"frame": seconds} | result.seconds).items()
@@ -226,10 +226,10 @@ def _summary(frame: str, one: dict[str, Any]) -> str:
     """One line about one object in one frame."""
     if not one["success"]:
         return f"{frame}: {one['object']}: no pose found"
-    from ipjax.inference.reports import UNSURE_TURN
+    from ipjax.inference.reports import AMBIGUOUS_TURN
 
     turn = one["ambiguity"]["std_deg"]
-    ending = f"; may be turned (± {turn:.0f}° about one axis)" if turn > UNSURE_TURN else ""
+    ending = f"; may be turned (± {turn:.0f}° about one axis)" if turn > AMBIGUOUS_TURN else ""
     if not one["present"]:
         ending += "; NOT HERE, or not seen well enough: the pose is a guess"
     x, y, z = (1e3 * v for v in one["camera_from_object"]["translation_m"])

@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ipjax.cameras import resize_pixels
 from ipjax.files.objects.record import ObjectInfo
-from ipjax.inference.reports import UNSURE_TURN
+from ipjax.inference.reports import AMBIGUOUS_TURN
 from ipjax.records import PoseEstimate
 
 INK = (238, 240, 245)
@@ -80,7 +80,7 @@ def draw_card(estimate: PoseEstimate, info: ObjectInfo, evidence: Evidence | Non
         ("inliers", f"{int(estimate.inliers)} pairs, rms {1e3 * float(estimate.rmse):.1f} mm"),
     ]
     turn = np.degrees(float(np.linalg.norm(np.asarray(estimate.ambiguity))))
-    if turn > UNSURE_TURN:
+    if turn > AMBIGUOUS_TURN:
         rows.append(("may be turned", f"± {turn:.0f}° about one axis"))
     if pairs:
         assert evidence is not None

@@ -30,10 +30,10 @@ CONVENTIONS = {
     "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
 }
 
-UNSURE_TURN = 25.0  # degrees of standard deviation above which reports name the axis
+AMBIGUOUS_TURN = 25.0  # degrees of standard deviation above which reports name the axis
 
 
-def tell_pose(camera_from_b: Similarity[np.ndarray], unit: str) -> dict[str, Any]:
+def pose_as_json(camera_from_b: Similarity[np.ndarray], unit: str) -> dict[str, Any]:
     """A similarity to camera metres for JSON; `unit` names what the scale is per."""
     rigid = Similarity(camera_from_b.rotation, camera_from_b.translation, np.ones(()))
     return {
@@ -56,14 +56,14 @@ def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> Similarit
     return camera_from_mesh @ info.reference.camera_from_mesh.to_numpy().inverse()
 
 
-def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict[str, Any]:
+def relative_pose_as_json(camera_from_object: Similarity, info: ObjectInfo) -> dict[str, Any]:
     """The pose relative to the reference photo for JSON, with its scale and, where the photo had depth, without.
 
     Raises ValueError as `relative_pose`.
     """
     pose = relative_pose(camera_from_object, info)
     assert info.reference is not None
-    entry = tell_pose(pose, "reference_unit")
+    entry = pose_as_json(pose, "reference_unit")
     entry["reference_unit"] = "m" if info.reference.metric else None
     entry["reference_photo"] = info.reference.file
     entry["rotation_degrees"] = float(np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1) / 2, -1, 1))))
@@ -80,7 +80,7 @@ def tell_relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> dict
     return entry
 
 
-def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo, alternatives: int = 4) -> dict:
+def estimate_as_json(estimate: PoseEstimate, templates: Templates, info: ObjectInfo, alternatives: int = 4) -> dict:
     """One object's estimate for JSON; `pose` is null where none was found.
 
     ``camera_from_mesh`` maps the coordinates of the user's mesh file to camera metres; ``camera_from_object`` maps the
@@ -107,10 +107,10 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
     if not found:
         return entry
     pose, object_from_mesh = estimate.camera_from_object.to_numpy(), info.object_from_mesh.to_numpy()
-    entry["camera_from_mesh"] = tell_pose(pose @ object_from_mesh, "mesh_unit")
-    entry["camera_from_object"] = tell_pose(pose, "model_unit")
+    entry["camera_from_mesh"] = pose_as_json(pose @ object_from_mesh, "mesh_unit")
+    entry["camera_from_object"] = pose_as_json(pose, "model_unit")
     if info.reference is not None:
-        entry["camera_from_reference_camera"] = tell_relative_pose(estimate.camera_from_object, info)
+        entry["camera_from_reference_camera"] = relative_pose_as_json(estimate.camera_from_object, info)
     entry["size_mm"] = {
         "diameter": 1e3 * float(pose.scale),
         "box": [1e3 * float(pose.scale) * float(side) for side in np.asarray(templates.extents)],
@@ -142,7 +142,7 @@ def tell_estimate(estimate: PoseEstimate, templates: Templates, info: ObjectInfo
         entry["alternatives"].append(
             {
                 "score": float(scores[i]),
-                "camera_from_mesh": tell_pose(other @ object_from_mesh, "mesh_unit"),
+                "camera_from_mesh": pose_as_json(other @ object_from_mesh, "mesh_unit"),
             }
         )
     return entry

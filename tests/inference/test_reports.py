@@ -9,7 +9,7 @@ import pytest
 from builders.estimates import make_estimate
 from builders.objects import make_object
 
-from ipjax.inference.reports import tell_estimate, to_json
+from ipjax.inference.reports import estimate_as_json, to_json
 from ipjax.records import PoseEstimate, Similarity
 
 
@@ -29,7 +29,7 @@ def test_the_pose_maps_the_users_mesh_to_camera_metres():
     rotation = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     rotation *= np.linalg.det(rotation)
     translation, scale = np.array([0.1, -0.2, 0.9]), 0.03
-    told = json.loads(to_json(tell_estimate(estimate_of(info, rotation, translation, scale), templates, info)))
+    told = json.loads(to_json(estimate_as_json(estimate_of(info, rotation, translation, scale), templates, info)))
     pose = told["camera_from_mesh"]
     np.testing.assert_allclose(pose["rotation"], rotation, atol=1e-6)
     np.testing.assert_allclose(pose["translation_m"], translation, atol=1e-6)
@@ -53,6 +53,6 @@ def test_failure_is_told_without_numbers_that_are_not():
         dataclasses.replace(good, success=jnp.asarray(False)),
         dataclasses.replace(good, camera_from_object=Similarity(jnp.eye(3) * jnp.nan, jnp.zeros(3), jnp.asarray(1.0))),
     ):
-        told = tell_estimate(bad, templates, info)
+        told = estimate_as_json(bad, templates, info)
         assert told["success"] is False and told["camera_from_mesh"] is None and told["confidence"] == 0
         to_json(told)

@@ -19,7 +19,7 @@ from ipjax.files.cameras.intrinsics import Intrinsics
 from ipjax.files.objects.loading import check, load
 from ipjax.files.objects.record import Reference
 from ipjax.files.objects.saving import save
-from ipjax.inference.reports import CONVENTIONS, relative_pose, tell_relative_pose
+from ipjax.inference.reports import CONVENTIONS, relative_pose, relative_pose_as_json
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.onboarding import photo as photos
 from ipjax.onboarding.foreground import Photo
@@ -100,7 +100,7 @@ def test_the_pose_relative_to_the_photo_is_the_motion_of_the_camera(metric):
     np.testing.assert_allclose(relative_pose(here, info).to_matrix(), motion.to_matrix(), atol=1e-5)
     # An estimate half as large again at the same place: the rigid motion still takes the centre to the centre.
     large = similarity(here.rotation, here.translation, 1.5 * float(here.scale))
-    told = tell_relative_pose(large, info)
+    told = relative_pose_as_json(large, info)
     assert told["scale_m_per_reference_unit"] == pytest.approx(1.5, rel=1e-5) and told["reference_unit"] == "m"
     np.testing.assert_allclose(told["rigid_motion"], motion.to_matrix(), atol=1e-5)
     assert told["rotation_degrees"] == pytest.approx(np.degrees(0.7), abs=1e-3)
@@ -111,7 +111,7 @@ def test_without_depth_the_reference_has_no_unit(metric):
     free = dataclasses.replace(
         metric.info, metres_per_unit=None, reference=dataclasses.replace(metric.info.reference, metric=False)
     )
-    told = tell_relative_pose(similarity(np.eye(3), np.array([0, 0, 1.0]), 0.1), free)
+    told = relative_pose_as_json(similarity(np.eye(3), np.array([0, 0, 1.0]), 0.1), free)
     assert told["reference_unit"] is None and "rigid_motion" not in told
     assert free.measured_diameter is None
 
