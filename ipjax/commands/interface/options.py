@@ -26,7 +26,7 @@ def add_output(
 
 def add_reporting(parser: Any, *, quiet: str | None = None) -> None:
     """``--json``; and ``--quiet``, where there are notes or progress bars to leave out."""
-    parser.add_argument("--json", action="store_true", help="the result as JSON on the screen, and nothing else there")
+    parser.add_argument("--json", action="store_true", help="print the result as one JSON document; notes go to stderr")
     if quiet is not None:
         parser.add_argument("--quiet", action="store_true", help=quiet)
 
