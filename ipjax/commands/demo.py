@@ -1,7 +1,6 @@
 """``ipjax demo``: all of it on a made scene, where the truth is known."""
 
 import argparse
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +43,5 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
 
     found = run_demo(arguments.output, encoder, seed=arguments.seed)
     good = found is not None and found.good
-    messages.finish(
-        {
-            "folder": str(arguments.output),
-            "found": good,
-            "off_by": None if found is None else dataclasses.asdict(found),
-            "units": "rotation degrees; translation, true_size, size metres; add, adds shares of the true diameter",
-        }
-    )
+    messages.finish({"folder": str(arguments.output), "found": good, **({} if found is None else found.as_json())})
     return 0 if good else 1

@@ -48,6 +48,17 @@ class Comparison:
         """Whether the estimated surface lies where the object is."""
         return self.adds < GOOD
 
+    def as_json(self) -> dict[str, float]:
+        """The same with names that end in their unit; ``_diameters``: shares of the true diameter."""
+        return {
+            "rotation_deg": self.rotation,
+            "translation_mm": 1e3 * self.translation,
+            "true_diameter_mm": 1e3 * self.true_size,
+            "diameter_mm": 1e3 * self.size,
+            "add_diameters": self.add,
+            "adds_diameters": self.adds,
+        }
+
 
 def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Config = Config()) -> Comparison | None:
     """Make a scene, onboard a distorted and rescaled copy of one of its objects, find it, compare with the truth.
