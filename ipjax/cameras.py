@@ -160,11 +160,11 @@ def _parts(camera: Any) -> tuple[Any, Any, Any]:
     return np, camera[..., [0, 1], [0, 1]], camera[..., :2, 2]
 
 
-def mostly(cover: Float[Array, "h w"] | Float[np.ndarray, "h w"]) -> Any:
-    """The pixels of which at least half are covered, as booleans: the mask, where a mask was averaged.
+def mask_from_coverage(cover: Float[Array, "h w"] | Float[np.ndarray, "h w"]) -> Any:
+    """The pixels that an object covers by at least half, as booleans: a mask again, after a mask was averaged.
 
-    Of those that are covered by exactly half, which are many where an image was halved, every other one: all of them
-    would let the mask grow by a quarter of a pixel on every side.
+    Many pixels are covered by exactly half where an image was halved. Every other one of them counts: if all did, the
+    mask would grow by a quarter of a pixel on every side.
     """
     height, width = cover.shape
     odd = np.indices((height, width)).sum(0) % 2

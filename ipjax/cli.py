@@ -1,7 +1,7 @@
-"""The ``ipjax`` command: hands the words to the file of `ipjax.commands` that they name, and says errors in one line.
+"""The ``ipjax`` command: runs the module of `ipjax.commands` that the first word names, and prints errors in one line.
 
-Exit status: 0 done, 1 done but something is wrong (doctor, no pose found), 2 could not: one line on stderr says why.
-``IPJAX_DEBUG=1`` shows the traceback.
+Exit status: 0 success, 1 a negative result (something missing, no pose found), 2 an error, of which one line on stderr
+says why. ``IPJAX_DEBUG=1`` shows the traceback.
 
 argparse is kept: it is in the standard library and loads in 10 ms, argcomplete completes it, and what click and typer
 would add (types, checks and messages in words) is written here anyway, since files and settings need it, too.
@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from ipjax import __version__
 from ipjax.commands import degrade, demo, doctor, estimate, evaluate, export, onboard, score, weights
 from ipjax.commands.interface import completion
-from ipjax.commands.interface.messages import Messages, in_one_line, is_meant_for_users
+from ipjax.commands.interface.messages import Messages, in_one_line, is_user_error
 from ipjax.commands.interface.parser import Parser
 
 COMMANDS = (onboard, estimate, demo, doctor, weights, score, evaluate, degrade, export)  # as --help lists them
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = parser.parse_args(argv)
         messages = Messages(json=arguments.json, quiet=getattr(arguments, "quiet", False))
-        with messages.listening(), warnings.catch_warnings():
+        with messages.capturing_logs(), warnings.catch_warnings():
             if not debug:
                 warnings.simplefilter("ignore")
             return arguments.run(arguments, messages)
@@ -54,14 +54,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (ValueError, OSError, MemoryError, RuntimeError, AssertionError) as error:
-        if debug or not is_meant_for_users(error):
+        if debug or not is_user_error(error):
             raise
         print(f"ipjax: {in_one_line(error)}", file=sys.stderr)
         return 2
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of all commands; their files are light, and what they need is imported when they run."""
+    """The parser of all commands; what a command needs is imported when it runs, not here."""
     parser = Parser(
         prog="ipjax",
         description="From one photo of an object and one RGB-D image of a scene to the object's metric 6-D pose.",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from ipjax import cameras
-from ipjax.cameras import borders, look_at, middle, mostly, project, turn, unproject
+from ipjax.cameras import borders, look_at, mask_from_coverage, middle, project, turn, unproject
 from ipjax.records import Camera
 from ipjax.transforms import rotation_from_vector
 
@@ -205,7 +205,7 @@ def test_a_mask_that_is_halved_grows_to_no_side():
         for top in range(8, 12):
             mask = np.zeros((48, 48), np.float32)
             mask[top : top + 21, left : left + 17] = 1
-            half = np.asarray(mostly(cv2.resize(mask, (24, 24), interpolation=cv2.INTER_AREA)))
+            half = np.asarray(mask_from_coverage(cv2.resize(mask, (24, 24), interpolation=cv2.INTER_AREA)))
             area.append(4 * half.sum() / mask.sum())
             found = np.argwhere(half).mean(0)
             wanted = cameras.resize_pixels(np.argwhere(mask).mean(0), (48, 48), (24, 24))

@@ -32,7 +32,7 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
-    """Write the worse mesh and, if wanted, the map back; returns the exit status."""
+    """Write the degraded mesh and, if wanted, its similarity to the original; returns the exit status."""
     output = options.check_output(arguments.output, (".glb",))
     options.check_seed(arguments.seed)
     if arguments.alignment is not None:

@@ -1,4 +1,4 @@
-"""``ipjax demo``: all of it on a made scene, where the truth is known."""
+"""``ipjax demo``: onboarding and estimation on a synthetic scene, where the true pose is known."""
 
 import argparse
 from pathlib import Path
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.inference.compilation_cache import use_compilation_cache
 
     encoder = options.load_encoder(arguments)
-    messages.tell()
+    messages.print_notes()
     use_compilation_cache()
     from ipjax.commands.demo_scene import run_demo
 

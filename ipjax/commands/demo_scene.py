@@ -1,7 +1,7 @@
-"""The scene of ``ipjax demo``: an object is lost on a table, known only from a bad copy of itself, and found again.
+"""What ``ipjax demo`` runs: an object on a table, of which only a degraded mesh is known, is found.
 
-Everything is made in code, so nothing is needed but an encoder. The files left behind are those of a real case: a mesh
-as a reconstruction model makes them, a photo, a depth image, a mask and a camera.
+The scene is synthetic, so nothing is needed but an encoder. The files written are those of a real case: a mesh like one
+of a reconstruction model, a photo, a depth image, a mask and a camera.
 """
 
 import dataclasses
@@ -27,9 +27,9 @@ from ipjax.synthetic.degradation import degrade
 from ipjax.synthetic.objects import make_object
 from ipjax.synthetic.scenes import Scene, make_scene
 
-LOST = ("mug", "bottle", "corner", "wedge", "tee", "pot")  # what is looked for, by seed
+TARGETS = ("mug", "bottle", "corner", "wedge", "tee", "pot")  # the object to find, by seed
 LEVEL = 2  # of degradation: smoothed, bumpy, its texture blurred
-GOOD = 0.1  # share of the diameter by which a surface point may be off on average
+FOUND = 0.1  # ADD-S below this share of the diameter counts as found
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,13 +40,13 @@ class Comparison:
     translation: float  # of the object's centre, metres
     true_size: float  # diameter, metres
     size: float
-    add: float  # mean distance of corresponding surface points, share of the true diameter
-    adds: float  # the same to the nearest point: what symmetry forgives
+    add: float  # ADD: mean distance of corresponding surface points, share of the true diameter
+    adds: float  # ADD-S: the same to the nearest point, which ignores turns that a symmetric shape does not show
 
     @property
     def good(self) -> bool:
         """Whether the estimated surface lies where the object is."""
-        return self.adds < GOOD
+        return self.adds < FOUND
 
     def as_json(self) -> dict[str, float]:
         """The same with names that end in their unit; ``_diameters``: shares of the true diameter."""
@@ -78,12 +78,12 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
     def say(text: str) -> None:
         print(f"[{time.perf_counter() - start:5.1f} s] {text}", flush=True)
 
-    kind = LOST[seed % len(LOST)]
+    kind = TARGETS[seed % len(TARGETS)]
     others = [name for name in ("carton", "drum", "prism") if name != kind]
     original = make_object(kind, seed)
     scene = make_scene([original, *(make_object(name, seed) for name in others)], seed)
     inputs = write_inputs(folder, scene, 0)
-    say(f"a table with {len(scene.masks)} objects and clutter, drawn by {scene.backend}; the {kind} is lost")
+    say(f"a table with {len(scene.masks)} objects and clutter, drawn by {scene.backend}; the {kind} is to be found")
 
     copy, original_from_copy = degrade(original, LEVEL, seed)
     mesh_file = folder / f"{kind}.glb"
@@ -104,7 +104,7 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
     if not bool(result.estimate.success):
         say("no pose was found")
         return None
-    # Only a demo or an evaluation knows how the copy lies in the original.
+    # The copy's place in the original is known to demos and evaluations only, never to the estimate.
     camera_from_copy = result.estimate.camera_from_object.to_numpy() @ info.object_from_mesh.to_numpy()
     found = (camera_from_copy @ original_from_copy.inverse()).to_jax()
     comparison = compare(found, scene.camera_from_object[0], original)

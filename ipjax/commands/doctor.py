@@ -19,7 +19,7 @@ examples:
   ipjax doctor mug.ipjax box.ipjax
   ipjax doctor --json > machine.json        to be sent along with a question
 """
-Line = tuple[bool, str, str]  # fine, subject, what there is to say
+Line = tuple[bool, str, str]  # whether it works, what was checked, and the details
 
 _PACKAGES = ("jax", "jaxlib", "flax", "equinox", "optimistix", "mujoco", "trimesh", "opencv-python-headless", "numpy")
 
@@ -34,33 +34,33 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
-    """Look at everything, or at the object files given; returns the exit status: 1, something needed is missing."""
+    """Check the machine, or the object files given; returns the exit status: 1, something needed is missing."""
     if arguments.objects:
         return _run_files(arguments.objects, messages)
-    told = []
+    checks = []
     for good, subject, said in examine():
         messages.say(f" {subject:24} {said}", mark="ok " if good else "BAD", style="green" if good else "bold red")
-        told.append({"fine": good, "subject": subject, "said": said})
-    fine = all(line["fine"] for line in told)
+        checks.append({"fine": good, "subject": subject, "said": said})
+    fine = all(line["fine"] for line in checks)
     messages.say("everything needed works" if fine else "something needed is missing: see the lines marked BAD")
-    messages.finish({"fine": fine, "checks": told})
+    messages.finish({"fine": fine, "checks": checks})
     return 0 if fine else 1
 
 
 def _run_files(paths: list[Path], messages: Messages) -> int:
     from ipjax.files.objects.loading import check
 
-    told = []
+    checks = []
     for path in paths:
         lines = check(path)
         messages.say("\n".join([f"{path}: {lines[0]}", *(f"  {line}" for line in lines[1:])]))
-        told.append({"object_file": str(path), "said": lines})
-    messages.finish({"fine": True, "objects": told})
+        checks.append({"object_file": str(path), "said": lines})
+    messages.finish({"fine": True, "objects": checks})
     return 0
 
 
 def examine() -> Iterator[Line]:
-    """One line for each thing looked at, in the order in which they are needed; nothing raises."""
+    """One line for each check, in the order in which things are needed; nothing raises."""
     from importlib import metadata
 
     from ipjax import __version__
@@ -131,7 +131,7 @@ def _backends() -> Iterator[Line]:
 
     report = available_backends()
     for name, said in report.items():
-        # One renderer is enough: the others are told, not held against the machine.
+        # One renderer is enough: where one works, the others are listed and do not count as missing.
         yield said == "ok" or "ok" in report.values(), f"renderer {name}", said
 
 

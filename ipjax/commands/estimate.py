@@ -58,7 +58,9 @@ def add(commands: Any) -> None:
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--size", type=float, metavar="MM", help="the object's true diameter in millimetres, if known")
     size.add_argument("--diameter", type=float, metavar="METRES", help="the same in metres")
-    size.add_argument("--free-size", action="store_true", help="find the size even where the reference photo told it")
+    size.add_argument(
+        "--free-size", action="store_true", help="estimate the size even where the reference photo measured it"
+    )
     options.add_crop(parser)
     options.add_config(parser)
     options.add_seed(parser)
@@ -69,7 +71,7 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
-    """Estimate, tell and draw; returns the exit status, 1 where no object is present in any frame."""
+    """Estimate, print and draw; returns the exit status, 1 where no object is present in any frame."""
     frames = list_frames(arguments)
     _check(arguments)
     from ipjax.files.objects.loading import load
@@ -84,29 +86,29 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         choose_masks(frames, [info.name for _, info in objects], arguments)
     identities = [info.encoder for _, info in objects]
     encoder = load_matching_encoder(arguments.objects, identities, arguments.weights)
-    messages.tell()
+    messages.print_notes()
     use_compilation_cache()
     from ipjax.files.storage.writing import write_text
     from ipjax.inference.estimator import Estimator
     from ipjax.inference.reports import CONVENTIONS, to_json
 
     estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
-    told: list[dict[str, Any]] = []
+    entries: list[dict[str, Any]] = []
     for files in frames:
         try:
-            told.append(_estimate_frame(files, first, estimator, arguments, messages))
+            entries.append(_estimate_frame(files, first, estimator, arguments, messages))
         except (ValueError, OSError) as error:
             if not many:
                 raise
-            told.append({"frame": files.name, "error": in_one_line(error)})
+            entries.append({"frame": files.name, "error": in_one_line(error)})
             messages.note(f"{files.name}: {in_one_line(error)}")
             continue
-        messages.tell()
+        messages.print_notes()
         if arguments.output is None or not arguments.quiet:
-            for one in told[-1]["objects"]:
+            for one in entries[-1]["objects"]:
                 messages.say(_summary(files.name, one))
-    if many and all("error" in entry for entry in told):
-        raise ValueError(f"{arguments.frames}: no frame could be used; the first: {told[0]['error']}")
+    if many and all("error" in entry for entry in entries):
+        raise ValueError(f"{arguments.frames}: no frame could be used; the first: {entries[0]['error']}")
     text = to_json(
         {
             "format": "ipjax poses 1",
@@ -114,13 +116,13 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
             "config": arguments.config,
             "set": arguments.changes,
             "seed": arguments.seed,
-            "frames": told,
+            "frames": entries,
         }
     )
     if arguments.output is not None:
         write_text(arguments.output, text)
     messages.finish(text)
-    found = [one["present"] for entry in told for one in entry.get("objects", ())]
+    found = [one["present"] for entry in entries for one in entry.get("objects", ())]
     return 0 if any(found) else 1
 
 
@@ -145,7 +147,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 
 def _read_first(files: FrameFiles, arguments: argparse.Namespace) -> Images:
-    """A single frame: what is cheap to refuse is refused before weights are loaded and anything is compiled."""
+    """Read a single frame, so that bad images are refused before weights are loaded and anything is compiled."""
     from ipjax.inference.frames import frame
 
     images = read_frame(files, arguments)
@@ -158,7 +160,10 @@ def _read_first(files: FrameFiles, arguments: argparse.Namespace) -> Images:
 def _estimate_frame(
     files: FrameFiles, images: Images | None, estimator: Any, arguments: argparse.Namespace, messages: Messages
 ) -> dict[str, Any]:
-    """What is told of one frame; its picture is drawn. ``images``: where it has been read already."""
+    """Estimate the objects of one frame and draw its overlay; returns its entry in the result.
+
+    ``images``: the frame, where it has been read already.
+    """
     from ipjax.inference.reports import estimate_as_json
 
     warned = len(messages.warnings)
@@ -190,7 +195,7 @@ def _estimate_frame(
                 },
             }
         )
-    told = {
+    entry: dict[str, Any] = {
         "frame": files.name,
         "rgb": str(files.rgb),
         "read_seconds": images.seconds,
@@ -199,13 +204,13 @@ def _estimate_frame(
     }
     if arguments.overlay is not None:
         start = time.perf_counter()
-        told["overlay"] = str(_draw(files.name, images, results, estimator.config, arguments))
-        told["draw_seconds"] = round(time.perf_counter() - start, 6)
-    return told
+        entry["overlay"] = str(_draw(files.name, images, results, estimator.config, arguments))
+        entry["draw_seconds"] = round(time.perf_counter() - start, 6)
+    return entry
 
 
 def _draw(name: str, images: Images, results: list[Any], config: Any, arguments: argparse.Namespace) -> Path:
-    """Write the picture of one frame; where it is."""
+    """Write the overlay of one frame; returns its path."""
     import numpy as np
 
     from ipjax.inference.drawing import draw, gather_evidence, write_image

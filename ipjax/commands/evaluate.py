@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     alignments = studies.parse_numbered(arguments.alignment, "--alignment")
     dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
     encoder = options.load_encoder(arguments)
-    messages.tell()
+    messages.print_notes()
     use_compilation_cache()
     known = studies.prepare(
         dataset,

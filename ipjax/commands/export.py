@@ -10,7 +10,7 @@ from ipjax.commands.interface.parser import add_command, parse_count
 
 EXAMPLES = """\
 The artifact takes dictionaries of arrays; templates are inputs, so it serves every object of the same shapes.
-Its inputs, outputs and settings are told in a JSON file beside it.
+A JSON file with the same name and .json at its end describes its inputs, outputs and settings.
 
 examples:
   ipjax export mug.ipjax -o estimate.stablehlo

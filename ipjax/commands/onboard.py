@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         found = examine(templates, info, mesh, encoder, config, backend=arguments.backend)
         write_report(arguments.report, templates, info, mesh, found, photo, backend=arguments.backend)
         warned = found.warnings
-    messages.tell()
+    messages.print_notes()
     count = len(templates.camera_from_object.scale)
     seconds = time.perf_counter() - start
     if not arguments.quiet:
@@ -171,7 +171,7 @@ def _from_photo(arguments: argparse.Namespace, config: Any) -> tuple[Any, Any, A
 
 
 def _shared(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What both ways of onboarding take."""
+    """The arguments that onboarding a mesh and a photo have in common."""
     return {
         "out": arguments.output,
         "name": arguments.name,

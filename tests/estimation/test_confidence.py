@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ipjax.config import ConfidenceConfig
-from ipjax.estimation.confidence import covariance, find_rival, loosest_turn, pair_information, probability
+from ipjax.estimation.confidence import covariance, find_rival, pair_information, probability, rotation_ambiguity
 from ipjax.records import Agreement, Pairs, Similarity
 from ipjax.synthetic import problems
 from ipjax.transforms import retract, rotation_from_vector
@@ -135,16 +135,16 @@ def test_alternatives_turned_about_one_axis_name_it(seed, angle):
     pose = make_pose(seed)
     turned = pose.rotation @ rotation_from_vector(jnp.asarray(angle * axis, jnp.float32))
     both = many(pose, dataclasses.replace(pose, rotation=turned))
-    found = loosest_turn(both, jnp.array([0.8, 0.8]), 1e-6 * jnp.eye(3), CONFIG)
+    found = rotation_ambiguity(both, jnp.array([0.8, 0.8]), 1e-6 * jnp.eye(3), CONFIG)
     length = float(jnp.linalg.norm(found))
     assert abs(float(found @ axis)) / length > 0.999
     assert length == pytest.approx(angle / 2**0.5, rel=1e-2)  # two equals, one turned by the angle
-    alone = loosest_turn(both, jnp.array([0.8, -1.0]), 1e-6 * jnp.eye(3), CONFIG)
+    alone = rotation_ambiguity(both, jnp.array([0.8, -1.0]), 1e-6 * jnp.eye(3), CONFIG)
     assert float(jnp.linalg.norm(alone)) < 0.01
 
 
 def test_without_alternatives_the_covariance_decides():
     pose = make_pose(4)
     own = pose.rotation @ jnp.diag(jnp.array([0.01, 0.0001, 0.0001])) @ pose.rotation.T
-    found = loosest_turn(many(pose, pose), jnp.array([0.8, -1.0]), own, CONFIG)
+    found = rotation_ambiguity(many(pose, pose), jnp.array([0.8, -1.0]), own, CONFIG)
     np.testing.assert_allclose(np.abs(found), [0.1, 0, 0], atol=1e-3)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ipjax.config import Config, MatchConfig
-from ipjax.estimation.matching import match, resemblance, select
+from ipjax.estimation.matching import match, pooled_similarity, select
 from ipjax.inference.batching import compact
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Camera, Patches, Similarity, Surface, Templates
@@ -203,7 +203,7 @@ def test_a_shortlist_searches_the_likeliest_templates_only(templates, query, see
     """What it finds is what the exhaustive search finds among them; the others rank below, alike."""
     rng = np.random.default_rng(seed)
     masked = eqx.tree_at(lambda q: q.valid, query, jnp.asarray(np.asarray(query.valid) & (rng.random(64) < 0.8)))
-    listed = np.sort(np.argsort(-np.asarray(resemblance(templates.patches, masked)), kind="stable")[:3])
+    listed = np.sort(np.argsort(-np.asarray(pooled_similarity(templates.patches, masked)), kind="stable")[:3])
     fewer = jax.tree.map(lambda x: x[listed], templates.patches)
     reference = match(masked, eqx.tree_at(lambda t: t.patches, templates, fewer), MatchConfig(views=2))
     found = match(masked, templates, MatchConfig(views=2, shortlist=3))
@@ -219,10 +219,10 @@ def test_the_shortlist_holds_the_template_that_is_the_query(templates):
     """A template asked for itself resembles itself most, with other numbers of patches and in any order."""
     for view in range(8):
         patches = jax.tree.map(lambda x, view=view: x[view, ::-1], templates.patches)
-        alike = np.asarray(resemblance(templates.patches, patches))
+        alike = np.asarray(pooled_similarity(templates.patches, patches))
         assert alike.argmax() == view and abs(alike[view] - 1) < 1e-5
         compacted = compact(templates, multiple=8).patches
-        np.testing.assert_allclose(resemblance(compacted, patches), alike, atol=1e-5)
+        np.testing.assert_allclose(pooled_similarity(compacted, patches), alike, atol=1e-5)
 
 
 def test_a_shortlist_as_long_as_the_object_changes_nothing(templates, query):

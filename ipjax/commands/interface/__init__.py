@@ -1,1 +1,1 @@
-"""How a command line speaks and is spoken to: shared options, the frames that options name, messages, completion."""
+"""What all commands share: options, reading the frames that they name, messages, completion."""

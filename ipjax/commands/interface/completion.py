@@ -1,7 +1,7 @@
 """What the shell offers when Tab is pressed, through argcomplete where it is installed.
 
 A shell asks by running the command with ``_ARGCOMPLETE`` set; otherwise argcomplete is not even imported. The names of
-settings are read off the source of `ipjax.config`: importing it takes a second, which is long for a key.
+settings are parsed from the source of `ipjax.config`: importing it takes a second, which is long to wait for Tab.
 """
 
 import argparse

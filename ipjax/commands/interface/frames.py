@@ -92,13 +92,13 @@ def _single_frame(arguments: argparse.Namespace) -> FrameFiles:
 
 
 def _mask_folder(folder: Path) -> Path | None:
-    # BOP's mask/ holds whole silhouettes, and what hides a part of the object is in front of it.
+    # BOP's mask/ holds whole silhouettes, in which occluders lie over the object: mask_visib/ is the one to use.
     names = ("mask_visib", "mask", "masks") if (folder / "scene_gt.json").is_file() else ("mask", "masks", "mask_visib")
     return next((folder / name for name in names if (folder / name).is_dir()), None)
 
 
 def choose_masks(frames: list[FrameFiles], names: list[str], arguments: argparse.Namespace) -> None:
-    """Fill in the masks of a folder's frames; what is wrong with one of them stands in its ``error``.
+    """Fill in the masks of a folder's frames; a frame without a usable mask says why in its ``error``.
 
     Args:
         frames: of `list_frames`.

@@ -14,8 +14,11 @@ NO_DEVICE = (
 )
 
 
-def is_meant_for_users(error: BaseException) -> bool:
-    """Whether the message speaks to the user; a RuntimeError does only where no renderer works or memory ends."""
+def is_user_error(error: BaseException) -> bool:
+    """Whether an error is to be shown as one line, because its message is written for the user.
+
+    Of RuntimeErrors only those are that no renderer works, that memory is used up, or that a device is missing.
+    """
     if not isinstance(error, RuntimeError | AssertionError):
         return True
     return (
@@ -37,7 +40,7 @@ def in_one_line(error: BaseException) -> str:
 
 
 def _lacks_devices(error: BaseException) -> bool:
-    """Whether JAX has none of the devices that JAX_PLATFORMS asks for; it says so, or asserts that it has."""
+    """Whether JAX has none of the devices that JAX_PLATFORMS asks for; its error says so, or is a bare assertion."""
     if "Unable to initialize backend" in str(error):
         return True
     if not os.environ.get("JAX_PLATFORMS") or "jax" not in sys.modules:
@@ -50,11 +53,12 @@ def _lacks_devices(error: BaseException) -> bool:
 
 
 class Messages(logging.Handler):
-    """The voice of one command.
+    """What one command prints.
 
-    What the library logs is kept until `tell`: a command that fails says one line and nothing else. Results for people
-    go to the standard output, in colour on a terminal and plain otherwise. With ``json`` they are left out; whatever is
-    printed goes to the error stream, and the standard output holds one JSON document, which `finish` writes.
+    What the library logs is held back until `print_notes`, so that a command that fails prints one line and nothing
+    else. Results for people go to the standard output, in colour on a terminal and plain otherwise. With ``json`` they
+    are left out; whatever is printed goes to the error stream, and the standard output holds one JSON document, which
+    `finish` writes.
 
     Args:
         json: the result is wanted as JSON.
@@ -64,15 +68,15 @@ class Messages(logging.Handler):
     def __init__(self, *, json: bool = False, quiet: bool = False):
         super().__init__()
         self.json, self.quiet = json, quiet
-        self.warnings: list[str] = []  # all of them, also those that were told
-        self.at_once = False  # tell warnings as they come, where they explain why it takes long
-        self._kept: list[str] = []
-        self._known: set[str] = set()
-        self._out = sys.stdout
+        self.warnings: list[str] = []  # all of them, also those that were printed
+        self.immediate = False  # print warnings as they come, where they explain why it takes long
+        self._pending: list[str] = []
+        self._noted: set[str] = set()
+        self._stdout = sys.stdout
 
     @contextlib.contextmanager
-    def listening(self) -> Iterator[None]:
-        """Hear what the library logs; with ``json``, keep everything but the document off the standard output."""
+    def capturing_logs(self) -> Iterator[None]:
+        """Collect what the library logs; with ``json``, keep everything but the document off the standard output."""
         logger = logging.getLogger("ipjax")
         level = logger.level
         logger.addHandler(self)
@@ -89,30 +93,30 @@ class Messages(logging.Handler):
         self.keep(record.getMessage(), is_warning=record.levelno >= logging.WARNING)
 
     def keep(self, line: str, *, is_warning: bool = False) -> None:
-        """Keep a note until `tell`; of many that are alike, one."""
+        """Hold a note back until `print_notes`; of equal ones, the first."""
         if is_warning:
             self.warnings.append(line)
-        if line in self._known:
+        if line in self._noted:
             return
-        self._known.add(line)
-        if self.at_once and is_warning:
+        self._noted.add(line)
+        if self.immediate and is_warning:
             print(line, file=sys.stderr, flush=True)
         else:
-            self._kept.append(line)
+            self._pending.append(line)
 
-    def tell(self) -> None:
-        """Print the notes that were kept; with ``quiet``, none."""
-        for line in self._kept if not self.quiet else ():
+    def print_notes(self) -> None:
+        """Print the notes that were held back; with ``quiet``, none."""
+        for line in self._pending if not self.quiet else ():
             print(line, file=sys.stderr)
-        self._kept.clear()
+        self._pending.clear()
 
     def note(self, line: str) -> None:
-        """A note at once; with ``quiet``, none."""
+        """Print a note now; with ``quiet``, none."""
         if not self.quiet:
             print(line, file=sys.stderr, flush=True)
 
     def say(self, text: str, *, mark: str = "", style: str = "") -> None:
-        """A line of the result, for people; ``style`` colours ``mark``, which stands before it, on a terminal."""
+        """Print a line of the result, for people; on a terminal ``style`` colours the ``mark`` before it."""
         if self.json:
             return
         if mark and sys.stdout.isatty():
@@ -124,7 +128,7 @@ class Messages(logging.Handler):
             print(f"{mark}{text}", flush=True)
 
     def show(self, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """A table of the result, for people: fitted to a terminal, or in columns that another program can read."""
+        """Print a table of the result, for people: fitted to a terminal, or in columns that programs can read."""
         if self.json:
             return
         if sys.stdout.isatty():
@@ -152,5 +156,5 @@ class Messages(logging.Handler):
             import json
 
             document = json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        self._out.write(document)
-        self._out.flush()
+        self._stdout.write(document)
+        self._stdout.flush()

@@ -12,15 +12,15 @@ METRICS = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
-# --- what goes out ----------------------------------------------------------------------------------------------------
+# --- output -----------------------------------------------------------------------------------------------------------
 
 
 def add_output(
-    parser: Any, metavar: str, said: str, *, required: bool = False, default: Path | None = None
+    parser: Any, metavar: str, text: str, *, required: bool = False, default: Path | None = None
 ) -> argparse.Action:
     """``-o``, the file or folder that a command writes."""
     return parser.add_argument(
-        "-o", "--output", type=Path, metavar=metavar, required=required, default=default, help=said
+        "-o", "--output", type=Path, metavar=metavar, required=required, default=default, help=text
     )
 
 
@@ -109,9 +109,9 @@ def read_views(arguments: argparse.Namespace, *more: str) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 
-def add_seed(parser: Any, said: str = "same seed, same answer") -> None:
+def add_seed(parser: Any, text: str = "same seed, same answer") -> None:
     """``--seed``."""
-    parser.add_argument("--seed", type=int, default=0, help=f"{said} (default 0)")
+    parser.add_argument("--seed", type=int, default=0, help=f"{text} (default 0)")
 
 
 def check_seed(seed: int) -> int:
@@ -131,8 +131,8 @@ def add_crop(parser: Any) -> None:
 
 def add_weights(parser: Any) -> None:
     """``--weights``, where the object files say all else about their encoder."""
-    said = "of the encoder (default: the best that is here)"
-    action = parser.add_argument("--weights", metavar="NAME|FILE", help=said)
+    text = "of the encoder (default: the best that is here)"
+    action = parser.add_argument("--weights", metavar="NAME|FILE", help=text)
     completion.attach(action, completion.complete_weights)
 
 
@@ -154,43 +154,43 @@ def load_encoder(arguments: argparse.Namespace) -> Any:
 # --- images -----------------------------------------------------------------------------------------------------------
 
 
-def add_depth(parser: Any, said: str) -> None:
+def add_depth(parser: Any, text: str) -> None:
     """``--depth`` and its unit, and the camera that both images share."""
-    parser.add_argument("--depth", type=Path, metavar="FILE", help=said)
+    parser.add_argument("--depth", type=Path, metavar="FILE", help=text)
     parser.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
     parser.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
     parser.add_argument("--image", type=int, metavar="ID", help="which image of a BOP scene_camera.json")
 
 
-def add_mask(parser: Any, said: str, box: str, *, many: bool = False) -> None:
+def add_mask(parser: Any, mask_text: str, box_text: str, *, many: bool = False) -> None:
     """``--mask``, ``--mask-label`` and ``--box``: one of each or, for ``many`` objects, as many as there are."""
     action = "append" if many else "store"
     label = "which of the numbers in a mask of several objects" + ("; one for each object" if many else "")
-    parser.add_argument("--mask", type=Path, metavar="FILE", action=action, help=said)
+    parser.add_argument("--mask", type=Path, metavar="FILE", action=action, help=mask_text)
     parser.add_argument("--mask-label", type=int, metavar="N", action=action, help=label)
-    parser.add_argument("--box", type=parse_box, metavar="X,Y,W,H", action=action, help=box)
+    parser.add_argument("--box", type=parse_box, metavar="X,Y,W,H", action=action, help=box_text)
 
 
 # --- data sets --------------------------------------------------------------------------------------------------------
 
 
 def add_dataset(parser: Any) -> None:
-    """The data set, as the next word, and which part of it."""
+    """The data set, as a positional argument, and which part of it."""
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument("--split", default="test", help="which split (default test)")
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
 
 
-def add_scoring(parser: Any, default: tuple[str, ...], told: str, bad: str) -> None:
-    """What is measured, what it is compared with, and what is left out."""
+def add_scoring(parser: Any, default: tuple[str, ...], default_text: str, skip_text: str) -> None:
+    """What is measured, what it is compared with, and what is left out; the texts are for ``--help``."""
     parser.add_argument(
         "--metrics",
         nargs="+",
         choices=METRICS,
         metavar="METRIC",
         default=default,
-        help=f"of {', '.join(METRICS)} (default: {told})",
+        help=f"of {', '.join(METRICS)} (default: {default_text})",
     )
     parser.add_argument("--against", type=Path, metavar="CSV", help="another result file, compared object by object")
     parser.add_argument("--without", nargs="+", metavar="SCENE/IMAGE", help="also score without these images")
-    parser.add_argument("--skip-bad", action="store_true", help=bad)
+    parser.add_argument("--skip-bad", action="store_true", help=skip_text)

@@ -50,12 +50,12 @@ def test_a_terminal_is_coloured_and_nothing_is_cut_off(monkeypatch):
 
 def test_with_json_only_the_document_is_on_the_standard_output(capsys):
     messages = Messages(json=True)
-    with messages.listening():
+    with messages.capturing_logs():
         print("a progress report of something deeper")
         messages.say("for people")
         messages.show(("name", "count"), ROWS)
         logging.getLogger("ipjax").info("a note")
-        messages.tell()
+        messages.print_notes()
         messages.finish({"size": 0.5, "name": "mug ½"})
     out, error = capsys.readouterr()
     assert json.loads(out) == {"size": 0.5, "name": "mug ½"}
@@ -64,17 +64,17 @@ def test_with_json_only_the_document_is_on_the_standard_output(capsys):
         messages.finish({"size": float("nan")})
 
 
-def test_notes_are_kept_until_they_are_told_and_said_once(capsys):
+def test_notes_are_held_back_until_they_are_printed_once(capsys):
     messages, quiet = Messages(), Messages(quiet=True)
     log = logging.getLogger("ipjax")
     level = log.level
-    with messages.listening(), quiet.listening():
+    with messages.capturing_logs(), quiet.capturing_logs():
         for _ in range(3):
             log.warning("the same")
         assert capsys.readouterr().err == ""
-        messages.tell()
-        quiet.tell()
+        messages.print_notes()
+        quiet.print_notes()
         quiet.note("nothing")
     assert capsys.readouterr().err == "the same\n" and messages.warnings == ["the same"] * 3
-    log.warning("nobody listens")
+    log.warning("after the command")
     assert messages.warnings == ["the same"] * 3 and log.level == level
