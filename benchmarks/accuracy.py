@@ -16,30 +16,37 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measure import describe_device
-from ipjax.bop import run as studies
-from ipjax.bop.dataset import MM, Dataset, read_results
-from ipjax.bop.evaluation import Score, evaluate
+from ipjax.bop.dataset import Dataset
+from ipjax.bop.estimator import DatasetEstimator
+from ipjax.bop.evaluation import evaluate
+from ipjax.bop.objects import OnboardedObject, parse_numbered, prepare_objects
+from ipjax.bop.records import MM
+from ipjax.bop.results import read_results
+from ipjax.bop.scoring.summaries import Score
 from ipjax.files.settings import read_config
 from ipjax.files.storage.writing import write_text
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.inference.compilation_cache import use_compilation_cache
 
 
-def run(dataset: Dataset, known, encoder, config: str, output: Path, *, keep: bool = False):
+def run(
+    dataset: Dataset, objects: dict[int, OnboardedObject], encoder, config: str, output: Path, *, keep: bool = False
+) -> tuple[Score, DatasetEstimator]:
     """The score of one configuration, and what found it."""
-    finder = studies.Finder(known, encoder, read_config(config), keep=keep)
+    estimator = DatasetEstimator(objects, encoder, read_config(config), keep=keep)
     found = evaluate(
         dataset,
-        list(known),
-        finder,
+        list(objects),
+        estimator,
         output / Path(config).stem,
         method=f"ipjax-{Path(config).stem}",
-        settings=finder.settings(),
-        alignments=studies.alignments_of(known),
+        settings=estimator.settings(),
+        alignments=estimator.alignments,
+        aligned_by=estimator.aligned_by,
         metrics=("mssd", "mspd", "add", "add_s"),
         on_error="skip",
     )
-    return found, finder
+    return found, estimator
 
 
 def cells(instance, diameter: float) -> list[str]:
@@ -96,19 +103,19 @@ def main() -> None:
     dataset = Dataset(options.data, models=options.models)
     encoder = load_encoder(options.weights)
     print(f"encoder: {encoder.identity}")
-    meshes = studies.parse_numbered(options.mesh, "--mesh")
-    known = studies.prepare(
+    meshes = parse_numbered(options.mesh, "--mesh")
+    objects = prepare_objects(
         dataset,
         encoder,
         folder=None if options.objects == "auto" else options.objects,
         objects=options.only,
         meshes=meshes,
-        alignments=studies.parse_numbered(options.alignment, "--alignment"),
+        alignments=parse_numbered(options.alignment, "--alignment"),
     )
     configs = ["default", "paper"] if options.config == "both" else [options.config]
-    diameters = {obj_id: dataset.models()[obj_id].diameter for obj_id in known}
+    diameters = {obj_id: dataset.models()[obj_id].diameter for obj_id in objects}
     output = options.output / options.data.name
-    runs = {Path(c).stem: run(dataset, known, encoder, c, output, keep=bool(meshes)) for c in configs}
+    runs = {Path(c).stem: run(dataset, objects, encoder, c, output, keep=bool(meshes)) for c in configs}
     heads = ["rot °", "trans mm", "scale %", "ADD-S %d"]
     print(f"{'scene':>5} {'image':>6} {'object':>6} " + " | ".join(f"{c}: {', '.join(heads)}" for c in runs))
     by_config = [score.instances for score, _ in runs.values()]
@@ -127,13 +134,13 @@ def main() -> None:
         for note in runs[name][0].notes:
             print(f"  note: {note}")
     for name in runs if meshes else []:
-        tell_reconstruction(dataset, *runs[name], name, output)
+        print_reconstruction(dataset, *runs[name], name, output)
     if options.json:
         record = {**describe_device(), "encoder": encoder.identity, "data": options.data.name, "figures": figures}
         write_text(options.json, json.dumps(record, indent=1) + "\n", parents=True)
 
 
-def tell_reconstruction(dataset: Dataset, found: Score, finder, name: str, output: Path) -> None:
+def print_reconstruction(dataset: Dataset, found: Score, estimator: DatasetEstimator, name: str, output: Path) -> None:
     """ADD-S and the long axis of what was found from a reconstructed mesh, and its picture."""
     from ipjax.inference.drawing import draw, gather_evidence, write_image
 
@@ -147,10 +154,10 @@ def tell_reconstruction(dataset: Dataset, found: Score, finder, name: str, outpu
             f"{name}: object {one.obj_id}, ADD-S {one.add_s / MM:.1f} mm, long axis off by "
             f"{long_axis_error(dataset, rows[key]):.1f}°"
         )
-        if key in finder.results:  # not where a finished run was only read again
-            result, frame = finder.results[key], dataset.frame(*key[:2])
+        if key in estimator.results:  # not where a finished run was only read again
+            result, frame = estimator.results[key], dataset.frame(*key[:2])
             evidence = gather_evidence(
-                result.templates, result.query, result.crop_estimate, result.info, finder.estimator.config
+                result.templates, result.query, result.crop_estimate, result.info, estimator.estimator.config
             )
             path = output / f"{name}_{one.scene_id:06d}_{one.im_id:06d}_{one.obj_id:06d}.png"
             write_image(path, draw(frame.rgb, frame.camera, [result.estimate], [result.info], [evidence]))

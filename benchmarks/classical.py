@@ -17,13 +17,17 @@ from typing import Any
 import numpy as np
 
 from ipjax import cameras
-from ipjax.bop import run as studies
-from ipjax.bop.dataset import MM, Dataset, Estimate, Frame, Target
-from ipjax.bop.evaluation import Alignment, evaluate, read_alignment
+from ipjax.bop.alignments import read_alignment
+from ipjax.bop.dataset import Dataset
+from ipjax.bop.evaluation import evaluate
+from ipjax.bop.objects import OWN_MAP, parse_numbered
+from ipjax.bop.records import MM, Estimate, Frame, Target
+from ipjax.bop.scoring.tables import format_score
 from ipjax.files.meshes.loading import load_mesh
 from ipjax.files.meshes.mesh import Mesh
 from ipjax.files.weights.hashes import hash_file
 from ipjax.synthetic.degradation import degrade
+from ipjax.transforms import Similarity
 
 INSTALL = "the classical baseline needs Open3D: pip install open3d"
 
@@ -50,7 +54,8 @@ class Body:
     mesh: Mesh
     metres: float  # per unit of the mesh
     source: str  # the file's sha256
-    alignment: Alignment | None = None  # None: the mesh is in the annotated model's frame
+    model_from_mesh: Similarity[np.ndarray] | None = None  # None: the mesh is in the annotated model's frame
+    aligned_by: str = ""  # where that comes from
 
 
 def import_open3d() -> Any:
@@ -86,7 +91,7 @@ def read_bodies(
     meshes: Mapping[int, Path] | None = None,
     alignments: Mapping[int, Path] | None = None,
 ) -> dict[int, Body]:
-    """The meshes that `ipjax.bop.run.prepare` onboards, with the scale that it keeps from the method."""
+    """The meshes that `ipjax.bop.objects.prepare_objects` onboards, with the scale that it keeps from the method."""
     wanted = {row.obj_id for row in dataset.targets}
     wanted = sorted(wanted if objects is None else wanted & set(objects))
     found = {}
@@ -95,12 +100,13 @@ def read_bodies(
         path = Path(own) if own is not None else dataset.model_path(obj_id, "models")
         mesh, source = load_mesh(path), hash_file(path)
         if own is not None:
-            alignment = read_alignment((alignments or {})[obj_id])
-            found[obj_id] = Body(mesh, alignment.scale, source, alignment)
+            aligned = Path((alignments or {})[obj_id])
+            model_from_mesh = read_alignment(aligned)
+            found[obj_id] = Body(mesh, float(model_from_mesh.scale), source, model_from_mesh, aligned.name)
         elif quality:
             mesh, back = degrade(mesh, quality, seed)
-            alignment = Alignment(back.scale * MM, back.rotation, back.translation * MM, studies.OWN_MAP)
-            found[obj_id] = Body(mesh, alignment.scale, source, alignment)
+            model_from_mesh = Similarity(back.rotation, back.translation * MM, np.asarray(back.scale * MM))
+            found[obj_id] = Body(mesh, float(model_from_mesh.scale), source, model_from_mesh, OWN_MAP)
         else:
             found[obj_id] = Body(mesh, MM, source)
     return found
@@ -116,6 +122,16 @@ class Classical:
         self.notes = ["the method was told each object's true size"]
         self.open3d.utility.set_verbosity_level(self.open3d.utility.VerbosityLevel.Error)  # one warning per target
         self._models: dict[int, tuple[Any, Any, float]] = {}
+
+    @property
+    def alignments(self) -> dict[int, Similarity[np.ndarray]]:
+        """``model_from_mesh`` of the bodies that have one."""
+        return {o: b.model_from_mesh for o, b in self.bodies.items() if b.model_from_mesh is not None}
+
+    @property
+    def aligned_by(self) -> dict[int, str]:
+        """Where each comes from."""
+        return {o: self.bodies[o].aligned_by for o in self.alignments}
 
     def settings(self) -> dict[str, Any]:
         """What the results depend on, as plain JSON."""
@@ -143,7 +159,7 @@ class Classical:
                 continue
             body = self.bodies[target.obj_id]
             camera_from_body, fitness = pose
-            scale = 1.0 if body.alignment is None else body.metres
+            scale = 1.0 if body.model_from_mesh is None else body.metres
             score = target.score * fitness
             found.append(Estimate(target.obj_id, score, camera_from_body[:3, :3], camera_from_body[:3, 3], scale))
         return found
@@ -257,23 +273,24 @@ def main() -> None:
         objects=options.only,
         quality=options.mesh_quality,
         seed=options.seed,
-        meshes=studies.parse_numbered(options.mesh, "--mesh"),
-        alignments=studies.parse_numbered(options.alignment, "--alignment"),
+        meshes=parse_numbered(options.mesh, "--mesh"),
+        alignments=parse_numbered(options.alignment, "--alignment"),
     )
-    finder = Classical(bodies, seed=options.seed)
+    estimator = Classical(bodies, seed=options.seed)
     found = evaluate(
         dataset,
         list(bodies),
-        finder,
+        estimator,
         options.output,
         method="classical",
-        settings=finder.settings(),
-        alignments={o: b.alignment for o, b in bodies.items() if b.alignment is not None},
+        settings=estimator.settings(),
+        alignments=estimator.alignments,
+        aligned_by=estimator.aligned_by,
         metrics=("mssd", "mspd", "vsd", "add", "add_s"),
         against=options.against,
     )
-    print(found.table())
-    for line in finder.refused:
+    print(format_score(found))
+    for line in estimator.refused:
         print(f"not found: {line}")
 
 

@@ -16,9 +16,13 @@ from typing import Any
 from benchmarks.classical import Classical, import_open3d, read_bodies
 from benchmarks.results_page.page import write_page
 from benchmarks.results_page.runs import read_studies
-from ipjax.bop import run as studies
-from ipjax.bop.dataset import Dataset, DatasetError
-from ipjax.bop.evaluation import Score, evaluate
+from ipjax.bop.dataset import Dataset
+from ipjax.bop.estimator import DatasetEstimator
+from ipjax.bop.evaluation import evaluate
+from ipjax.bop.objects import parse_numbered, prepare_objects
+from ipjax.bop.records import DatasetError
+from ipjax.bop.scoring.summaries import Score
+from ipjax.bop.scoring.tables import format_score
 from ipjax.files.settings import read_config
 from ipjax.files.storage.writing import write_text
 from ipjax.files.weights.encoder import load_encoder
@@ -50,7 +54,7 @@ class Study:
 
     def __init__(self, title: str, dataset: Dataset, folder: Path, options: argparse.Namespace, **meshes: Any):
         self.title, self.dataset, self.folder, self.options, self.meshes = title, dataset, folder, options, meshes
-        self._finder: studies.Finder | None = None
+        self.loaded: DatasetEstimator | None = None  # with its objects, for all methods
 
     @property
     def objects(self) -> list[int] | None:
@@ -65,15 +69,16 @@ class Study:
         for method in methods:
             start = time.perf_counter()
             folder = self.folder / Path(method).stem
-            finder, alignments, name = self.estimator(encoder, method)
+            estimator, objects, name = self.estimator(encoder, method)
             found = evaluate(
                 self.dataset,
-                list(alignments),
-                finder,
+                objects,
+                estimator,
                 folder,
                 method=name,
-                settings=finder.settings(),
-                alignments={o: a for o, a in alignments.items() if a is not None},
+                settings=estimator.settings(),
+                alignments=estimator.alignments,
+                aligned_by=estimator.aligned_by,
                 metrics=METRICS,
                 on_error="skip",
                 progress=not self.options.quiet,
@@ -83,20 +88,20 @@ class Study:
             )
             scores.append(found)
             folders.append(folder)
-            print(f"\n{found.table()}\n({time.perf_counter() - start:.0f} s)", flush=True)
-            for line in finder.refused:
+            print(f"\n{format_score(found)}\n({time.perf_counter() - start:.0f} s)", flush=True)
+            for line in estimator.refused:
                 print(f"not found: {line}")
         return folders
 
-    def estimator(self, encoder: Any, method: str) -> tuple[Any, dict[int, Any], str]:
-        """What runs, the alignment of each object or None, and the name in the tables."""
+    def estimator(self, encoder: Any, method: str) -> tuple[Any, list[int], str]:
+        """What runs, on which objects, and the name in the tables."""
         seed = self.options.seed
         if method == "classical":
             bodies = read_bodies(self.dataset, objects=self.objects, **self.meshes)
-            return Classical(bodies, seed=seed), {o: b.alignment for o, b in bodies.items()}, "classical"
+            return Classical(bodies, seed=seed), list(bodies), "classical"
         config = read_config(method)
-        if self._finder is None:
-            known = studies.prepare(
+        if self.loaded is None:
+            objects = prepare_objects(
                 self.dataset,
                 encoder,
                 folder=self.options.objects,
@@ -104,11 +109,10 @@ class Study:
                 progress=not self.options.quiet,
                 **self.meshes,
             )
-            self._finder = studies.Finder(known, encoder, config, seed=seed, share=True)
-            finder = self._finder
+            estimator = self.loaded = DatasetEstimator(objects, encoder, config, seed=seed, share=True)
         else:
-            finder = self._finder.beside(config)
-        return finder, {o: k.alignment for o, k in finder.known.items()}, f"ipjax-{Path(method).stem}"
+            estimator = self.loaded.with_config(config)
+        return estimator, list(estimator.objects), f"ipjax-{Path(method).stem}"
 
 
 def plan(options: argparse.Namespace) -> list[Study]:
@@ -134,8 +138,8 @@ def plan(options: argparse.Namespace) -> list[Study]:
         if Path(root) not in datasets:
             raise DatasetError(f"--reconstruction {root}: name the data set itself too")
         dataset, path = datasets[Path(root)], Path(mesh)
-        given = studies.parse_numbered([f"{number}={mesh}"], "--reconstruction")
-        aligned = studies.parse_numbered([f"{number}={alignment}"], "--reconstruction")
+        given = parse_numbered([f"{number}={mesh}"], "--reconstruction")
+        aligned = parse_numbered([f"{number}={alignment}"], "--reconstruction")
         title, folder = f"{dataset.name}, object {number} from {path.name}", options.output / dataset.name / path.stem
         found.append(Study(title, dataset, folder, options, meshes=given, alignments=aligned))
     return found
@@ -208,7 +212,7 @@ def main(arguments: list[str] | None = None) -> None:
                     "runs": [str(folder) for folder in folders],
                 }
             )
-            study._finder = None  # its templates are large
+            study.loaded = None  # its templates are large
         write_text(options.output / "studies.json", json.dumps(manifest, indent=1), parents=True)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None

@@ -63,7 +63,7 @@ class Group:
     object: str
     mesh: Any  # ipjax.files.meshes.mesh.Mesh; its present frame is the object's
     metres_per_unit: float  # of that mesh
-    model: Any  # ipjax.bop.evaluation.Model
+    model: Any  # ipjax.bop.scoring.errors.Model
     reference: Shot
     queries: list[Shot]
     made: bool = True  # tried with the true mesh, too
@@ -87,7 +87,7 @@ def view_angle(first: Shot, second: Shot) -> float:
 def ycbv_groups(folder: Path, objects: tuple[int, ...] = (2, 3, 4, 5, 8, 10, 15)) -> Iterator[Group]:
     """Every frame of an object as the reference of all its frames in other scenes."""
     from ipjax.bop.dataset import Dataset
-    from ipjax.bop.evaluation import Model
+    from ipjax.bop.scoring.errors import Model
 
     dataset = Dataset(folder)
     frames: dict[int, list[tuple[int, int, Any]]] = {number: [] for number in objects}
@@ -122,7 +122,7 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
     have the noise of a cheap sensor. Objects are those made in code and, where ``data`` is, the scans there.
     """
     from ipjax.bop.dataset import Dataset
-    from ipjax.bop.evaluation import Model
+    from ipjax.bop.scoring.errors import Model
     from ipjax.files.meshes.mesh import normalise
     from ipjax.rendering.render import render_scene
     from ipjax.synthetic.objects import KINDS, make_object
@@ -133,7 +133,7 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
     if data is not None:
         dataset = Dataset(data)
         scans = [(f"obj_{n:06d}", normalise(dataset.mesh(n, "models"))) for n in sorted(dataset.models())]
-    none = np.eye(3)[None], np.zeros((1, 3))
+    none = Similarity(np.eye(3)[None], np.zeros((1, 3)), np.ones(1))
     for turn in range(-(-pairs // each)):
         rng = np.random.default_rng([seed, turn])
         made = not (scans and turn % 2)
@@ -177,7 +177,7 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
         reference = Shot("photo", expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rigid(rotation, translation))
         points = mesh.vertices[np.unique(mesh.faces)] * size
         chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
-        model = Model(points[chosen], size, *none)
+        model = Model(points[chosen], size, none)
         yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries, made)
 
 
@@ -279,7 +279,8 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
     """
     from scipy.spatial import KDTree
 
-    from ipjax.bop.evaluation import Pose, surface_errors
+    from ipjax import metrics
+    from ipjax.bop.scoring.errors import stack, surface_errors
     from ipjax.inference.reports import relative_pose
 
     info = estimator.objects[0][1]
@@ -306,18 +307,16 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
         scale = float(pose.scale)
     model = group.model
     points, true = model.points, query.camera_from_object
-    truth, mine = true @ points, pose @ points
-    nearest = KDTree(mine).query(truth)[0].mean() / model.diameter
-    errors = surface_errors(
-        model, query.K[None], [Pose(true.rotation, true.translation)], [Pose(pose.rotation, pose.translation)]
-    )
+    tree = KDTree(points)
+    rigid_pose = rigid(pose.rotation, pose.translation)
+    errors = surface_errors(model, query.K[None], stack([true]), stack([rigid_pose]))
     middle = (points.min(0, keepdims=True) + points.max(0, keepdims=True)) / 2
     moved = (pose @ middle - true @ middle)[0]
     steps = np.arange(0.05, 0.51, 0.05)
     mssd, mspd = float(errors.mssd[0]) / model.diameter, float(errors.mspd[0]) * 640 / query.rgb.shape[1]
     return {
-        "add_s": float(nearest),
-        "add": float(np.linalg.norm(mine - truth, axis=-1).mean()) / model.diameter,
+        "add_s": float(metrics.add_s(points, true, pose, nearest=lambda x: tree.query(x)[0])) / model.diameter,
+        "add": float(metrics.add(points, true, pose)) / model.diameter,
         "rotation": float(np.degrees(errors.rotation[0])),
         "translation_mm": float(1e3 * np.linalg.norm(moved)),
         "scale": scale,

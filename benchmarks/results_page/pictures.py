@@ -15,7 +15,9 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
     and the model at the estimate."""
     import cv2
 
-    from ipjax.bop.dataset import MM, Dataset, read_results
+    from ipjax.bop.dataset import Dataset
+    from ipjax.bop.records import MM
+    from ipjax.bop.results import read_results
     from ipjax.inference.drawing import silhouette
 
     run = study.main
@@ -72,7 +74,8 @@ def draw_models(study: Study, chosen: list[dict], rows: dict) -> list[np.ndarray
     """The scanned model of each target at its estimate, on black: outlines cannot tell a front from a back."""
     import jax
 
-    from ipjax.bop.dataset import MM, Dataset
+    from ipjax.bop.dataset import Dataset
+    from ipjax.bop.records import MM
     from ipjax.records import Camera
     from ipjax.rendering.render import render_each
 

@@ -4,7 +4,7 @@ import time
 
 from benchmarks.measure import commit, describe_device
 from benchmarks.results_page.runs import HEADS, Study, knows_size, parts
-from ipjax.bop.evaluation import FEW, SIZED
+from ipjax.bop.scoring.tables import FEW, SIZED
 
 
 def overview(studies: list[Study]) -> list[list[str]]:

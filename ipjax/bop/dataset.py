@@ -1,138 +1,30 @@
-"""BOP data sets, detections and result files; and folders of one's own captures.
+"""BOP data sets on disc: images, cameras, annotations, targets and models.
 
 The format is https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md, scene-wise. Files are in
-millimetres; everything returned here is in metres, except `ResultRow`, which is a line of a BOP file as it stands.
-Everything is read when asked for. What cannot be read raises `DatasetError`: one sentence that names the file.
+millimetres; everything returned here is in metres. Everything is read when asked for. What cannot be read raises
+`DatasetError`: one sentence that names the file.
 """
 
 import math
-import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
 
+from ipjax.bop.records import MM, DatasetError, Frame, ModelInfo, Target, TargetRow, Truth, check_rotation
 from ipjax.files.images.depth import read_depth
-from ipjax.files.images.masks import as_mask, read_mask
-from ipjax.files.images.opening import BYTES_PER_PIXEL, read_rgb, read_size
+from ipjax.files.images.masks import read_mask
+from ipjax.files.images.opening import read_rgb, read_size
 from ipjax.files.meshes.loading import load_mesh
 from ipjax.files.meshes.mesh import Mesh, move
-from ipjax.files.storage.budget import check_budget
 from ipjax.files.storage.parsing import read_json
-from ipjax.files.storage.writing import write_text
-from ipjax.metrics import SYMMETRY_STEP, discretise_symmetries
+from ipjax.metrics.symmetries import SYMMETRY_STEP, discretise_symmetries
+from ipjax.transforms import Similarity
 
-MM = 1e-3  # metres
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-HEADER = "scene_id,im_id,obj_id,score,R,t,time"
-SIZED_HEADER = HEADER + ",scale"  # ours: x_camera = scale · R · x_model + t
-ROTATION_SLACK = 0.01  # how far the singular values of a rotation may be from 1
 VISIBLE = 0.1  # share of an instance that must be visible for it to be a target (enumerate_test_targets.py)
-
-
-class DatasetError(ValueError):
-    """A file of a data set, or of results, is missing or damaged; the message names it and says what is wrong."""
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One RGB-D image as its sensor took it."""
-
-    rgb: UInt8[np.ndarray, "h w 3"]
-    depth: Float[np.ndarray, "h w"] | None  # metres along z, 0 = unknown; None where the data set has none
-    camera: Float[np.ndarray, "3 3"]  # K, pixels; the first pixel's centre is at (0, 0)
-    scene_id: int = 0
-    im_id: int = 0
-    name: str = ""
-
-
-@dataclass(frozen=True)
-class Target:
-    """One instance to be found in a frame."""
-
-    obj_id: int
-    mask: Bool[np.ndarray, "h w"] | None = None  # where to look; None where no mask is given
-    score: float = 1.0  # of the detection
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A pose found for an object: x_camera = scale · rotation · x_object + translation, metres."""
-
-    obj_id: int
-    score: float
-    rotation: np.ndarray  # 3 × 3
-    translation_m: np.ndarray  # 3
-    scale: float = 1.0  # metres per metre of the model; a BOP row cannot hold it
-
-
-@dataclass(frozen=True)
-class Truth:
-    """An annotated instance."""
-
-    obj_id: int
-    index: int  # among the image's annotations; names the mask
-    rotation: np.ndarray  # 3 × 3, float64
-    translation: np.ndarray  # 3, metres, float64
-    visible: float = 1.0  # share of the silhouette that is visible (visib_fract); −1 = unknown
-    box: tuple[int, int, int, int] | None = None  # visible, x y width height
-
-
-@dataclass(frozen=True)
-class TargetRow:
-    """A line of the file of test targets."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    count: int = 1
-
-
-@dataclass(frozen=True)
-class ModelInfo:
-    """What models_info.json says about an object, in metres."""
-
-    obj_id: int
-    diameter: float
-    symmetry_rotations: np.ndarray  # [s, 3, 3]; the first is the identity
-    symmetry_translations: np.ndarray  # [s, 3]
-
-
-@dataclass(frozen=True)
-class Detection:
-    """A detection or segmentation in BOP's JSON form; the mask is decoded when asked for."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    score: float
-    box: tuple[float, float, float, float] | None
-    time: float
-    segmentation: dict | None = field(repr=False, default=None)
-
-    @cached_property
-    def mask(self) -> np.ndarray | None:
-        """The segmentation as bool [h, w]; None where there is only a box."""
-        return None if self.segmentation is None else decode_rle(self.segmentation)
-
-
-@dataclass(frozen=True)
-class ResultRow:
-    """A line of a BOP result file, in its own units: millimetres and seconds."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    score: float
-    rotation: tuple[float, ...]  # nine numbers, row-major
-    translation: tuple[float, ...]  # three numbers, mm
-    time: float = -1.0  # for the whole image; −1 = unknown
-    line: int | None = field(default=None, compare=False)  # where it was read
-    scale: float | None = field(default=None, compare=False)  # estimated over true size; None = unknown
 
 
 def parse_images(names: Iterable[str] | None) -> list[tuple[int, int]]:
@@ -362,7 +254,8 @@ class Dataset:
                 )
             except (KeyError, TypeError, ValueError) as error:
                 raise DatasetError(f"{where}: the symmetries cannot be read ({error})") from None
-            found[int(key)] = ModelInfo(int(key), diameter * MM, rotations, translations * MM)
+            symmetries = Similarity(rotations, translations * MM, np.ones(len(rotations)))
+            found[int(key)] = ModelInfo(int(key), diameter * MM, symmetries)
         self._models[folder.name] = found
         return found
 
@@ -437,268 +330,6 @@ class Dataset:
             ]
         except (TypeError, ValueError, AttributeError):
             raise DatasetError(f"{where}: visib_fract must be a number") from None
-
-
-# COCO run-length masks (https://github.com/cocodataset/cocoapi/blob/master/common/maskApi.c describes the text form)
-
-
-def decode_rle(segmentation: dict) -> np.ndarray:
-    """Bool mask [h, w] of a COCO run-length encoding ``{"size": [h, w], "counts": …}``.
-
-    ``counts`` is a list of run lengths, or COCO's compressed text; runs go down the columns and begin with background.
-    Raises ValueError where the runs do not fill the image.
-    """
-    try:
-        height, width = (int(x) for x in segmentation["size"])
-        counts = segmentation["counts"]
-    except (KeyError, TypeError, ValueError):
-        raise ValueError("a run-length mask needs size [height, width] and counts") from None
-    # No mask is larger than an image may be.
-    check_budget(BYTES_PER_PIXEL * max(height, 0) * max(width, 0), f"a run-length mask of {width} × {height} pixels")
-    runs = np.asarray(_decompress(counts) if isinstance(counts, str | bytes) else counts)
-    if runs.ndim != 1 or (runs.size and runs.dtype.kind not in "ui") or (runs < 0).any():
-        raise ValueError("the counts of a run-length mask must be whole numbers, not negative")
-    # A single run beyond the mask could make the sum overflow.
-    longest = int(runs.max(initial=0))
-    covered = longest if longest > max(height * width, 0) else int(runs.sum())
-    if height < 1 or width < 1 or covered != height * width:
-        raise ValueError(f"the runs of a mask cover {covered} pixels, its size {height} × {width} needs more or less")
-    values = np.arange(len(runs)) % 2 == 1
-    return np.repeat(values, runs).reshape(width, height).T
-
-
-def encode_rle(mask: np.ndarray, *, compressed: bool = True) -> dict:
-    """COCO run-length encoding of a mask [h, w]; the inverse of `decode_rle`."""
-    mask = as_mask(mask)
-    flat = mask.T.reshape(-1)
-    edges = np.flatnonzero(np.diff(flat)) + 1
-    runs = np.diff(np.concatenate([[0], edges, [flat.size]])).tolist()
-    if flat.size and flat[0]:
-        runs.insert(0, 0)
-    return {"size": list(mask.shape), "counts": _compress(runs) if compressed else runs}
-
-
-def _decompress(text: str | bytes) -> list[int]:
-    """Run lengths from COCO's text: five bits a character, from the third on as differences to the one before last."""
-    data = text.encode("ascii", "replace") if isinstance(text, str) else text
-    runs: list[int] = []
-    at = 0
-    while at < len(data):
-        value, shift, more = 0, 0, True
-        while more:
-            if at >= len(data):
-                raise ValueError("a compressed mask ends in the middle of a number")
-            bits = data[at] - 48
-            if not 0 <= bits < 64:
-                raise ValueError("a compressed mask holds a character that is none of COCO's")
-            value |= (bits & 31) << shift
-            more = bool(bits & 32)
-            at += 1
-            shift += 5
-            if not more and bits & 16:
-                value |= -1 << shift
-        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-    return runs
-
-
-def _compress(runs: Sequence[int]) -> str:
-    text = []
-    for index, run in enumerate(runs):
-        value = run - (runs[index - 2] if index > 2 else 0)
-        more = True
-        while more:
-            bits = value & 31
-            value >>= 5
-            more = value != -1 if bits & 16 else value != 0
-            text.append(chr((bits | 32 if more else bits) + 48))
-    return "".join(text)
-
-
-def read_detections(path: str | Path) -> list[Detection]:
-    """Detections or segmentations in BOP's JSON form (scene_id, image_id, category_id, score, bbox, segmentation)."""
-    path = Path(path)
-    entries = _read_json(path)
-    if not isinstance(entries, list):
-        raise DatasetError(f"{path}: a list of detections is expected")
-    found = []
-    for number, entry in enumerate(entries):
-        where = f"{path}, entry {number}"
-        try:
-            box = entry.get("bbox")
-            detection = Detection(
-                int(entry["scene_id"]),
-                int(entry["image_id"]),
-                int(entry["category_id"]),
-                float(entry.get("score", 1.0)),
-                None if box is None else (float(box[0]), float(box[1]), float(box[2]), float(box[3])),
-                float(entry.get("time", -1.0)),
-                entry.get("segmentation"),
-            )
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-            raise DatasetError(
-                f"{where}: a detection needs scene_id, image_id, category_id, score ({error!r})"
-            ) from None
-        if not math.isfinite(detection.score):
-            raise DatasetError(f"{where}: the score is not a finite number")
-        found.append(detection)
-    return found
-
-
-def detected_targets(detections: Iterable[Detection], rows: Sequence[TargetRow]) -> list[Target]:
-    """For each target row of one image its best detections, as many as it has instances."""
-    detections = list(detections)
-    found = []
-    for row in rows:
-        mine = [d for d in detections if (d.scene_id, d.im_id, d.obj_id) == (row.scene_id, row.im_id, row.obj_id)]
-        mine.sort(key=lambda d: -d.score)
-        found += [Target(d.obj_id, d.mask, d.score) for d in mine[: row.count]]
-    return found
-
-
-# Results
-
-
-def read_results(path: str | Path, *, problems: list[str] | None = None) -> list[ResultRow]:
-    """The rows of a BOP result file.
-
-    A file of ours with the sizes (see `write_results`) has an eighth column, ``scale``.
-
-    Raises DatasetError (file, line, what is wrong) for a wrong header, a wrong number of columns or numbers, values
-    that are not finite, an R that is no rotation, rows that occur twice, or times that are negative or differ within
-    an image. Give a list as ``problems`` to have such rows left out, and the sentences collected there, instead.
-    """
-    path = Path(path)
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise DatasetError(f"{path}: not a text file") from None
-    header = lines[0].strip().replace(" ", "") if lines else ""
-    if header not in (HEADER, SIZED_HEADER):
-        first = lines[0].strip()[:80] if lines else "nothing"
-        raise DatasetError(f"{path}, line 1: the header must be {HEADER!r}, not {first!r}")
-    rows: list[ResultRow] = []
-    first_line: dict[tuple, int] = {}
-    times: dict[tuple[int, int], tuple[float, int]] = {}
-    for number, line in enumerate(lines[1:], start=2):
-        if not line.strip():
-            continue
-        try:
-            row = _parse_row(line, number, header)
-            key = (row.scene_id, row.im_id, row.obj_id, row.score, row.rotation, row.translation)
-            if key in first_line:
-                raise ValueError(f"the row is the same as that of line {first_line[key]}")
-            time, at = times.setdefault((row.scene_id, row.im_id), (row.time, number))
-            if abs(time - row.time) > 1e-3:
-                raise ValueError(
-                    f"time is for the whole image: {row.time:g} s here, but {time:g} s in line {at} (same image)"
-                )
-            first_line[key] = number
-        except ValueError as error:
-            message = f"{path}, line {number}: {error}"
-            if problems is None:
-                raise DatasetError(message) from None
-            problems.append(message)
-        else:
-            rows.append(row)
-    return rows
-
-
-def _parse_row(line: str, number: int, header: str = HEADER) -> ResultRow:
-    columns = line.strip().split(",")
-    expected = header.count(",") + 1
-    if len(columns) != expected:
-        raise ValueError(f"{expected} columns are expected ({header}), got {len(columns)}")
-    whole = []
-    for name, text in zip(("scene_id", "im_id", "obj_id"), columns[:3], strict=True):
-        if not re.fullmatch(r"\s*\d+\s*", text):
-            raise ValueError(f"{name} must be a whole number, got {text!r}")
-        whole.append(int(text))
-    score = _parse_numbers(columns[3], 1, "score")[0]
-    rotation = _parse_numbers(columns[4], 9, "R")
-    translation = _parse_numbers(columns[5], 3, "t")
-    check_rotation(rotation)
-    time = _parse_numbers(columns[6], 1, "time")[0]
-    if time < 0 and time != -1:
-        raise ValueError(f"time must be seconds, or -1 where it is unknown, got {time:g}")
-    scale = _parse_numbers(columns[7], 1, "scale")[0] if expected == 8 else None
-    if scale is not None and not scale > 0:
-        raise ValueError(f"scale must be positive, got {scale:g}")
-    return ResultRow(whole[0], whole[1], whole[2], score, rotation, translation, time, number, scale)
-
-
-def check_rotation(rotation: Sequence[float] | np.ndarray) -> None:
-    """Nothing where nine numbers are a rotation, row by row, up to rounding (official result files have determinants
-    within 0.003 of 1). Raises ValueError, in words, for what scales, mirrors or shears.
-    """
-    matrix = np.asarray(rotation, np.float64).reshape(3, 3)
-    stretch, det = np.linalg.svd(matrix, compute_uv=False), float(np.linalg.det(matrix))
-    if np.abs(stretch - 1).max() <= ROTATION_SLACK and det > 0:
-        return
-    if np.ptp(stretch) <= ROTATION_SLACK * max(stretch.max(), 1) and stretch.mean() > ROTATION_SLACK:
-        way = f"it scales by {stretch.mean():.4g}" if det > 0 else "it mirrors"
-    else:
-        way = "its rows are not at right angles and of length 1"
-    raise ValueError(f"R is no rotation: {way} (det R = {det:.4g}, where 1 is expected)")
-
-
-def _parse_numbers(text: str, count: int, name: str) -> tuple[float, ...]:
-    parts = text.split()
-    if len(parts) != count:
-        raise ValueError(f"{name} must hold {count} number{'s' if count > 1 else ''}, got {len(parts)}")
-    try:
-        numbers = tuple(float(part) for part in parts if "_" not in part)
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count:
-        raise ValueError(f"{name} holds something that is no number: {text.strip()[:60]!r}")
-    if not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{name} holds a number that is not finite: {text.strip()[:60]!r}")
-    return numbers
-
-
-def format_row(row: ResultRow) -> str:
-    """One line of a result file, without its end; numbers are written so that reading them gives them back."""
-    if len(row.rotation) != 9 or len(row.translation) != 3:
-        raise ValueError(f"a row needs 9 and 3 numbers, got {len(row.rotation)} and {len(row.translation)}")
-    numbers = (row.score, *row.rotation, *row.translation, row.time)
-    if not all(math.isfinite(x) for x in numbers):
-        raise ValueError(f"a result of scene {row.scene_id}, image {row.im_id}, object {row.obj_id} is not finite")
-    R = " ".join(repr(float(x)) for x in row.rotation)
-    t = " ".join(repr(float(x)) for x in row.translation)
-    time = "-1" if row.time == -1 else repr(float(row.time))
-    return f"{row.scene_id},{row.im_id},{row.obj_id},{float(row.score)!r},{R},{t},{time}"
-
-
-def write_results(path: str | Path, rows: Iterable[ResultRow], *, scales: Sequence[float] | None = None) -> Path:
-    """Write a result file as BOP's toolkit does (no newline at the end), whole or not at all.
-
-    With ``scales`` (estimated over true size, one for each row) it is no BOP file but one of ours, with a column more;
-    `sized_path` says where it belongs. Raises ValueError for a scale that is not positive and finite.
-    """
-    if scales is None:
-        return write_text(path, "\n".join([HEADER, *map(format_row, rows)]), parents=True)
-    lines = [SIZED_HEADER]
-    for row, scale in zip(rows, scales, strict=True):
-        if not 0 < scale < math.inf:
-            raise ValueError(f"scene {row.scene_id}, image {row.im_id}, object {row.obj_id}: its scale is {scale}")
-        lines.append(f"{format_row(row)},{float(scale)!r}")
-    return write_text(path, "\n".join(lines), parents=True)
-
-
-def sized_path(path: str | Path) -> Path:
-    """Where the sizes of a BOP result file are kept: beside it, as ``.sized``, which nobody takes for a BOP file."""
-    return Path(path).with_suffix(".sized")
-
-
-def as_row(scene_id: int, im_id: int, estimate: Estimate, time: float = -1.0) -> ResultRow:
-    """An estimate as a row: metres become millimetres. A BOP row has no place for the scale."""
-    rotation = np.asarray(estimate.rotation, np.float64).reshape(9)
-    translation = np.asarray(estimate.translation_m, np.float64).reshape(3) * 1000
-    return ResultRow(
-        scene_id, im_id, estimate.obj_id, float(estimate.score), tuple(rotation), tuple(translation), float(time)
-    )
 
 
 def _checked(read: Any, path: Path) -> Any:

@@ -69,20 +69,22 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     options.check_seed(arguments.seed)
     if arguments.against is not None and not arguments.against.is_file():
         raise ValueError(f"{arguments.against}: no such result file")
-    from ipjax.bop import run as studies
     from ipjax.bop.dataset import Dataset, parse_images
+    from ipjax.bop.estimator import DatasetEstimator
     from ipjax.bop.evaluation import evaluate
+    from ipjax.bop.objects import parse_numbered, prepare_objects
+    from ipjax.bop.scoring.tables import format_score
     from ipjax.config import OnboardConfig
     from ipjax.inference.compilation_cache import use_compilation_cache
 
     config = options.read_config(arguments)
-    meshes = studies.parse_numbered(arguments.mesh, "--mesh")
-    alignments = studies.parse_numbered(arguments.alignment, "--alignment")
+    meshes = parse_numbered(arguments.mesh, "--mesh")
+    alignments = parse_numbered(arguments.alignment, "--alignment")
     dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
     encoder = options.load_encoder(arguments)
     messages.print_notes()
     use_compilation_cache()
-    known = studies.prepare(
+    objects = prepare_objects(
         dataset,
         encoder,
         folder=None if arguments.objects == "auto" else arguments.objects,
@@ -94,17 +96,18 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         alignments=alignments,
         progress=not arguments.quiet,
     )
-    finder = studies.Finder(
-        known, encoder, config, crop=arguments.crop, seed=arguments.seed, known_size=arguments.known_size
+    estimator = DatasetEstimator(
+        objects, encoder, config, crop=arguments.crop, seed=arguments.seed, known_size=arguments.known_size
     )
     found = evaluate(
         dataset,
-        list(known),
-        finder,
+        list(objects),
+        estimator,
         arguments.output,
         method=_method(arguments),
-        settings=finder.settings(),
-        alignments=studies.alignments_of(known),
+        settings=estimator.settings(),
+        alignments=estimator.alignments,
+        aligned_by=estimator.aligned_by,
         on_error="skip" if arguments.skip_bad else "raise",
         progress=not arguments.quiet,
         metrics=arguments.metrics,
@@ -112,10 +115,10 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         without=parse_images(arguments.without),
         restart="always" if arguments.restart else "never",
     )
-    messages.say(found.table())
-    for line in finder.refused:
+    messages.say(format_score(found))
+    for line in estimator.refused:
         messages.say(f"not found: {line}")
-    messages.finish({**found.to_dict(), "not_found": finder.refused})
+    messages.finish({**found.to_dict(), "not_found": estimator.refused})
     return 0
 
 

@@ -42,7 +42,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     if arguments.output is not None:
         options.check_output(arguments.output, (".json",))
     from ipjax.bop.dataset import Dataset, parse_images
-    from ipjax.bop.evaluation import score
+    from ipjax.bop.scoring.scores import score
+    from ipjax.bop.scoring.tables import format_score
     from ipjax.inference.compilation_cache import use_compilation_cache
 
     use_compilation_cache()
@@ -57,7 +58,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         progress=sys.stderr.isatty(),
         without=parse_images(arguments.without),
     )
-    messages.say(found.table())
+    messages.say(format_score(found))
     if arguments.output is not None:
         found.write_json(arguments.output)
     messages.finish(found.to_dict())

@@ -8,7 +8,7 @@ from ipjax_kernels.positive import invert_positive, principal_axis, root
 from jaxtyping import Array, Bool, Float
 
 from ipjax.config import ConfidenceConfig
-from ipjax.metrics import turn_angle
+from ipjax.metrics.poses import turn_angle
 from ipjax.records import Agreement, Pairs, Similarity
 
 

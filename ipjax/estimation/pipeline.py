@@ -20,7 +20,7 @@ from ipjax.estimation.matching import match, select
 from ipjax.estimation.refinement import Cloud, information, refine, settle, trace_contour
 from ipjax.estimation.scoring import score, seen_share
 from ipjax.estimation.validity import finite_estimate, finite_query, finite_templates
-from ipjax.metrics import turn_angle
+from ipjax.metrics.poses import turn_angle
 from ipjax.records import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
 
 

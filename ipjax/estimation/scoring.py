@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from ipjax.cameras import project, resize_pixels
 from ipjax.config import ScoreConfig
 from ipjax.estimation.features import object_features
-from ipjax.metrics import turn_angle
+from ipjax.metrics.poses import turn_angle
 from ipjax.records import Agreement, Camera, Patches, Query, Similarity, Surface, Templates
 
 

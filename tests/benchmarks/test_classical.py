@@ -10,7 +10,7 @@ import pytest
 from builders.bop_roots import ERRORS, write_models
 
 from benchmarks import classical
-from ipjax.bop.dataset import MM, Frame
+from ipjax.bop.records import MM, Frame
 from ipjax.files.meshes.loading import load_mesh
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -5,6 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ipjax.bop.dataset import Dataset
+from ipjax.bop.records import Estimate
+from ipjax.bop.results import ResultRow, as_row
+
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 ERRORS = np.load(GOLDEN / "bop_pose_errors.npz")
 PROTOCOL = np.load(GOLDEN / "bop_protocol.npz")
@@ -146,3 +150,21 @@ def write_ellipsoids(root: Path, scenes: int = 2, images: int = 3, side: int = 1
         (folder / "scene_gt.json").write_text(json.dumps(truth))
     (root / "test_targets_bop19.json").write_text(json.dumps(targets))
     return root
+
+
+def protocol_rows() -> list[ResultRow]:
+    """The estimates of the golden protocol."""
+    columns = [PROTOCOL[f"est_{name}"].tolist() for name in ("scene", "im", "obj", "score")]
+    places = zip(*columns, PROTOCOL["est_R"].astype(float), PROTOCOL["est_t"].astype(float), strict=True)
+    return [ResultRow(s, i, o, c, tuple(R.ravel()), tuple(t)) for s, i, o, c, R, t in places]
+
+
+def true_rows(dataset: Dataset) -> list[ResultRow]:
+    """The annotated poses of all targets as rows."""
+    rows = []
+    for (scene, image), targets in dataset.targets_by_image().items():
+        for truth in dataset.truths(scene, image):
+            if truth.obj_id in {t.obj_id for t in targets}:
+                estimate = Estimate(truth.obj_id, truth.visible, truth.rotation, truth.translation)
+                rows.append(as_row(scene, image, estimate, 0.5))
+    return rows

@@ -11,7 +11,7 @@ import equinox as eqx
 
 from benchmarks import evaluation
 from ipjax import cli
-from ipjax.bop import run as studies
+from ipjax.bop.estimator import DatasetEstimator
 from ipjax.commands.interface import options
 from ipjax.synthetic.problems import CoordinateEncoder, make_encoder
 
@@ -26,20 +26,20 @@ plain = make_encoder()
 encoder = Named(plain.frequencies, plain.phases)
 options.load_encoder = lambda arguments: encoder
 evaluation.load_encoder = lambda *_, **__: encoder
-estimate = studies.Finder.__call__
+estimate = DatasetEstimator.__call__
 
 
-def slowly(finder, frame, targets):
+def slowly(estimator, frame, targets):
     time.sleep(float(sys.argv[1]))
-    return estimate(finder, frame, targets)
+    return estimate(estimator, frame, targets)
 
 
-studies.Finder.__call__ = slowly
+DatasetEstimator.__call__ = slowly
 if sys.argv[2] == "ipjax":
     sys.exit(cli.main(sys.argv[3:]))
 
-made: list[studies.Finder] = []
-beside = studies.Finder.beside
-studies.Finder.beside = lambda finder, config: (made.append(beside(finder, config)), made[-1])[1]
+made: list[DatasetEstimator] = []
+with_config = DatasetEstimator.with_config
+DatasetEstimator.with_config = lambda first, config: (made.append(with_config(first, config)), made[-1])[1]
 evaluation.main(sys.argv[3:])
-print("shared:", all(finder.shared_seconds > 0 for finder in made), len(made))
+print("shared:", all(estimator.shared_seconds > 0 for estimator in made), len(made))

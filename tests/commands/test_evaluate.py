@@ -157,7 +157,8 @@ def test_the_page_shows_the_model_where_the_estimate_is(place, whole):
 
     run = read_run(place / "whole")
     study = Study("balls", place / "balls", None, [run])
-    from ipjax.bop.dataset import Dataset, read_results
+    from ipjax.bop.dataset import Dataset
+    from ipjax.bop.results import read_results
 
     rows = {
         (r.scene_id, r.im_id, r.obj_id, r.score): r for r in read_results(next((place / "whole").glob("*-test.csv")))

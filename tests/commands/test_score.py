@@ -5,7 +5,7 @@ import json
 from builders.bop_roots import write_images
 from builders.command_lines import run
 
-from ipjax.bop.dataset import HEADER
+from ipjax.bop.results import HEADER
 
 ROW = "0,0,2,1.0,1 0 0 0 1 0 0 0 1,0 0 700,0.5"
 

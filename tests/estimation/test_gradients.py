@@ -18,7 +18,7 @@ import ipjax
 from ipjax.config import RefineConfig
 from ipjax.estimation.features import lift
 from ipjax.estimation.refinement import Cloud, refine, settle, trace_contour
-from ipjax.metrics import turn_angle
+from ipjax.metrics.poses import turn_angle
 from ipjax.records import Camera, Pairs
 from ipjax.synthetic import problems
 from ipjax.transforms import difference, retract, rotation_from_vector

@@ -13,7 +13,8 @@ from builders.layers import MODULES
 from builders.objects import make_object
 from PIL import Image
 
-from ipjax.bop import run as studies
+from ipjax.bop.estimator import DatasetEstimator, hash_code
+from ipjax.bop.objects import ONBOARDING, OnboardedObject, hash_origin
 from ipjax.config import OnboardConfig
 from ipjax.files.meshes.mesh import make_mesh
 from ipjax.files.meshes.saving import save_mesh
@@ -51,7 +52,7 @@ def changed(copies, module: str, *roots: str) -> bool:
 
 
 def test_one_byte_of_any_module_that_onboarding_executes_changes_the_key_and_of_no_other(copies):
-    executed = list_executed(*studies.ONBOARDING)
+    executed = list_executed(*ONBOARDING)
     assert {
         "ipjax.estimation.features",
         "ipjax.networks.dinov2",
@@ -59,11 +60,11 @@ def test_one_byte_of_any_module_that_onboarding_executes_changes_the_key_and_of_
         "ipjax_kernels.rasterize",
     } <= executed.keys()
     assert (
-        not {"ipjax.estimation.matching", "ipjax.estimation.refinement", "ipjax.cli", "ipjax.bop.evaluation"}
+        not {"ipjax.estimation.matching", "ipjax.estimation.refinement", "ipjax.cli", "ipjax.bop.scoring.scores"}
         & executed.keys()
     )
     modules = [name for name, path in MODULES.items() if path.name != "__init__.py"]
-    assert {name for name in modules if changed(copies, name, *studies.ONBOARDING)} == executed.keys()
+    assert {name for name in modules if changed(copies, name, *ONBOARDING)} == executed.keys()
 
 
 def test_what_is_loaded_is_what_is_listed():
@@ -100,7 +101,7 @@ def test_results_hang_on_the_estimate(copies):
         "ipjax.estimation.refinement",
         "ipjax_kernels.consensus",
     } <= executed
-    assert not {"ipjax.cli", "ipjax.networks.triposr.model", "ipjax.bop.evaluation"} & executed
+    assert not {"ipjax.cli", "ipjax.networks.triposr.model", "ipjax.bop.scoring.scores"} & executed
 
 
 def test_the_key_of_an_object_file(tmp_path):
@@ -108,7 +109,7 @@ def test_the_key_of_an_object_file(tmp_path):
     mesh = dataclasses.replace(triangle, uv=np.eye(3)[:, :2], texture=np.full((4, 4, 3), 90, np.uint8))
     save_mesh(mesh, tmp_path / "a.obj")
     source, config, encoder = tmp_path / "a.obj", OnboardConfig(), encoder_called("an encoder")
-    key = lambda **more: studies._key(source, encoder, more.pop("config", config), more.pop("quality", 0), 0, **more)
+    key = lambda **more: hash_origin(source, encoder, more.pop("config", config), more.pop("quality", 0), 0, **more)
     first = key()
     assert first == key() and len(first) == 16
     assert key(hash_code=lambda *_: "other") != first
@@ -117,7 +118,7 @@ def test_the_key_of_an_object_file(tmp_path):
     told = []
     for quality in (0, 2):
         key(quality=quality, hash_code=lambda *modules: told.append(modules) or "")
-    assert told == [studies.ONBOARDING, (*studies.ONBOARDING, "ipjax.synthetic.degradation")]
+    assert told == [ONBOARDING, (*ONBOARDING, "ipjax.synthetic.degradation")]
     # Textures count by whatever name the material gives them; what lies there besides does not.
     (tmp_path / "unrelated.png").write_bytes(b"x")
     assert key() == first
@@ -136,8 +137,8 @@ def test_other_content_of_an_object_file_is_another_setting(tmp_path):
     settings = []
     for name in ("mug", "mug", "cup"):
         save(tmp_path / "a.ipjax", templates, dataclasses.replace(info, name=name))
-        finder = studies.Finder({1: studies.Known(1, tmp_path / "a.ipjax")}, encoder_called(info.encoder))
-        settings.append(finder.settings())
+        estimator = DatasetEstimator({1: OnboardedObject(1, tmp_path / "a.ipjax")}, encoder_called(info.encoder))
+        settings.append(estimator.settings())
         assert settings[-1]["objects"]["1"]["content"] == load(tmp_path / "a.ipjax")[1].content_sha256
     assert settings[0] == settings[1] != settings[2]
-    assert settings[0]["code"] == studies.hash_code()
+    assert settings[0]["code"] == hash_code()

@@ -18,8 +18,7 @@ from PIL import Image
 CHILD = """
 import json, resource, sys
 from pathlib import Path
-from ipjax.bop import dataset as bop
-from ipjax.bop import evaluation
+from ipjax.bop import alignments, dataset, detections, masks
 from ipjax.files.cameras.reading import read_camera
 from ipjax.onboarding.foreground import read_photo
 from ipjax.files.images.depth import read_depth
@@ -28,16 +27,16 @@ from ipjax.files.images.opening import read_rgb, read_size
 from ipjax.files.settings import read_config
 
 def read_rle(path):
-    return bop.decode_rle(json.loads(Path(path).read_text()))
+    return masks.decode_rle(json.loads(Path(path).read_text()))
 
 def read_truths(path):
     scene = Path(path).parent / "bop" / "test" / "000001"
     scene.mkdir(parents=True, exist_ok=True)
     (scene / "scene_gt.json").write_text(Path(path).read_text())
-    return bop.Dataset(scene.parent.parent).truths(1, 0)
+    return dataset.Dataset(scene.parent.parent).truths(1, 0)
 
 readers = dict(rgb=read_rgb, depth=read_depth, mask=read_mask, camera=read_camera, photo=read_photo, rle=read_rle,
-               detections=bop.read_detections, settings=read_config, alignment=evaluation.read_alignment,
+               detections=detections.read_detections, settings=read_config, alignment=alignments.read_alignment,
                truths=read_truths, size=read_size)
 told = {}
 for path in sorted(Path(sys.argv[1]).iterdir()):

@@ -1,0 +1,1 @@
+"""Scoring result files: targets, errors, recalls, tables."""

@@ -1,0 +1,107 @@
+"""Pose errors as the BOP benchmark and the YCB-V papers define them. Pure: written for one pose, the caller vmaps.
+
+Lengths may be in any unit, as long as all of them (points, translations, depths, tolerances, diameters) share it.
+Every pose is a ``camera_from_object``; ``truth`` comes before ``estimate``, what is fixed before what is new.
+Distances, averages and the parts of a pose are written once for JAX's arrays and for NumPy's, in whose precision they
+are then measured; the search among symmetries (`closest_symmetry`, `mssd`, `mspd`) and VSD are JAX alone. To measure
+MSSD in doubles, take `surface_distance` of the truth after the symmetry that `closest_symmetry` found.
+Definitions: https://github.com/thodan/bop_toolkit (pose_error.py, misc.py) and Hodan et al., "BOP Challenge 2020 on 6D
+Object Localization", section 2.2. Comparisons are strict (error < threshold), except VSD's pixel cost (>=).
+
+Each name is imported from its module when it is first used: the graph needs one of them, and is not to depend on all.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ipjax.metrics.poses import rotation_error as rotation_error
+    from ipjax.metrics.poses import scale_error as scale_error
+    from ipjax.metrics.poses import translation_error as translation_error
+    from ipjax.metrics.poses import turn_angle as turn_angle
+    from ipjax.metrics.precision import average_precision as average_precision
+    from ipjax.metrics.precision import detection_precision as detection_precision
+    from ipjax.metrics.precision import match_poses as match_poses
+    from ipjax.metrics.recalls import ADD_LIMIT as ADD_LIMIT
+    from ipjax.metrics.recalls import PIXEL_THRESHOLDS as PIXEL_THRESHOLDS
+    from ipjax.metrics.recalls import SIZE_TOLERANCES as SIZE_TOLERANCES
+    from ipjax.metrics.recalls import THRESHOLDS as THRESHOLDS
+    from ipjax.metrics.recalls import area_under_accuracy as area_under_accuracy
+    from ipjax.metrics.recalls import average_recall as average_recall
+    from ipjax.metrics.recalls import recall as recall
+    from ipjax.metrics.surface import SizedErrors as SizedErrors
+    from ipjax.metrics.surface import add as add
+    from ipjax.metrics.surface import add_s as add_s
+    from ipjax.metrics.surface import closest_symmetry as closest_symmetry
+    from ipjax.metrics.surface import mspd as mspd
+    from ipjax.metrics.surface import mssd as mssd
+    from ipjax.metrics.surface import projection_distance as projection_distance
+    from ipjax.metrics.surface import projections_overlap as projections_overlap
+    from ipjax.metrics.surface import reprojection_error as reprojection_error
+    from ipjax.metrics.surface import sized_errors as sized_errors
+    from ipjax.metrics.surface import spheres_overlap as spheres_overlap
+    from ipjax.metrics.surface import surface_distance as surface_distance
+    from ipjax.metrics.symmetries import SYMMETRY_STEP as SYMMETRY_STEP
+    from ipjax.metrics.symmetries import discretise_symmetries as discretise_symmetries
+    from ipjax.metrics.visible import distances_from_camera as distances_from_camera
+    from ipjax.metrics.visible import visibility as visibility
+    from ipjax.metrics.visible import vsd as vsd
+
+# Where each of them is.
+_HOMES = {
+    "poses": (
+        "rotation_error",
+        "scale_error",
+        "translation_error",
+        "turn_angle",
+    ),
+    "precision": (
+        "average_precision",
+        "detection_precision",
+        "match_poses",
+    ),
+    "recalls": (
+        "ADD_LIMIT",
+        "PIXEL_THRESHOLDS",
+        "SIZE_TOLERANCES",
+        "THRESHOLDS",
+        "area_under_accuracy",
+        "average_recall",
+        "recall",
+    ),
+    "surface": (
+        "SizedErrors",
+        "add",
+        "add_s",
+        "closest_symmetry",
+        "mspd",
+        "mssd",
+        "projection_distance",
+        "projections_overlap",
+        "reprojection_error",
+        "sized_errors",
+        "spheres_overlap",
+        "surface_distance",
+    ),
+    "symmetries": (
+        "SYMMETRY_STEP",
+        "discretise_symmetries",
+    ),
+    "visible": (
+        "distances_from_camera",
+        "visibility",
+        "vsd",
+    ),
+}
+_HOME = {name: f"ipjax.metrics.{module}" for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    raise AttributeError(f"module 'ipjax.metrics' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME})
