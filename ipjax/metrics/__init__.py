@@ -94,7 +94,6 @@ _HOMES = {
     ),
 }
 _HOME = {name: f"ipjax.metrics.{module}" for module, names in _HOMES.items() for name in names}
-__all__ = sorted(_HOME)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,7 @@ def rigid(rotation, translation) -> Similarity[np.ndarray]:
 
 
 @pytest.mark.parametrize("number", OBJECTS)
-def test_pose_errors_are_bops_to_twelve_digits(number):
+def test_distances_are_bops_to_twelve_digits(number):
     points = ERRORS[f"obj{number}_pts"].astype(np.float64)
     symmetries = rigid(*symmetries_of(number))
     for row in np.flatnonzero(ERRORS["obj_id"] == number):
@@ -36,9 +36,10 @@ def test_pose_errors_are_bops_to_twelve_digits(number):
         for name, value in found.items():  # mm, px; a perfect pose is 0 up to rounding
             np.testing.assert_allclose(value, ERRORS[name][row], rtol=1e-12, atol=2e-10, err_msg=name)
         # The golden rotations are rounded to float32; what uses their inverse sees it.
-        np.testing.assert_allclose(metrics.add_s(points, truth, estimate, block=100), ERRORS["adi"][row], 1e-7, 1e-9)
+        np.testing.assert_allclose(metrics.add_s(points, truth, estimate, block=100), ERRORS["adi"][row], 1e-6, 1e-9)
         angle = np.degrees(metrics.rotation_error(truth.rotation, estimate.rotation))
-        np.testing.assert_allclose(angle, ERRORS["re"][row], atol=1e-4)  # by arccos of the trace there
+        # The toolkit takes the arccos of the trace, which sees the rounding near 0 and 180 degrees.
+        np.testing.assert_allclose(angle, ERRORS["re"][row], rtol=1e-4, atol=2e-4)
         diameter = float(ERRORS[f"obj{number}_diameter"])
         assert metrics.spheres_overlap(diameter, truth, estimate) == ERRORS["spheres_overlap_3d"][row]
         overlap = metrics.projections_overlap(diameter, truth, estimate)
