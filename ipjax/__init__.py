@@ -8,6 +8,10 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ipjax.bop.dataset import Dataset
+    from ipjax.bop.evaluation import evaluate
+    from ipjax.bop.results import read_results, write_results
+    from ipjax.bop.scoring.scores import score
     from ipjax.config import (
         AlignConfig,
         ConfidenceConfig,
@@ -20,14 +24,27 @@ if TYPE_CHECKING:
     )
     from ipjax.estimation.features import describe, observe
     from ipjax.estimation.pipeline import estimate
+    from ipjax.files.cameras.intrinsics import Intrinsics
+    from ipjax.files.cameras.reading import read_camera
+    from ipjax.files.images.depth import read_depth
+    from ipjax.files.images.masks import read_mask
+    from ipjax.files.images.opening import read_rgb
+    from ipjax.files.meshes.loading import load_mesh
+    from ipjax.files.meshes.mesh import Mesh
+    from ipjax.files.meshes.saving import save_mesh
     from ipjax.files.objects.loading import load
     from ipjax.files.objects.saving import save
     from ipjax.files.weights.encoder import load_encoder
     from ipjax.inference.batching import compact, pad_templates
     from ipjax.inference.drawing import draw
-    from ipjax.inference.frames import frame
+    from ipjax.inference.estimator import Estimator
+    from ipjax.inference.frames import frame, frame_turned
     from ipjax.onboarding.mesh import onboard
+    from ipjax.onboarding.photo import onboard_photo
     from ipjax.records import Camera, Patches, PoseEstimate, Query, Surface, Templates, View
+    from ipjax.synthetic.degradation import degrade
+    from ipjax.synthetic.objects import make_object
+    from ipjax.synthetic.scenes import make_scene
     from ipjax.transforms import Similarity
 
 __version__ = "0.1.0"
@@ -36,8 +53,12 @@ __all__ = [
     "Camera",
     "ConfidenceConfig",
     "Config",
+    "Dataset",
     "DescribeConfig",
+    "Estimator",
+    "Intrinsics",
     "MatchConfig",
+    "Mesh",
     "OnboardConfig",
     "Patches",
     "PoseEstimate",
@@ -49,20 +70,42 @@ __all__ = [
     "Templates",
     "View",
     "compact",
+    "degrade",
     "describe",
     "draw",
     "estimate",
+    "evaluate",
     "frame",
+    "frame_turned",
     "load",
     "load_encoder",
+    "load_mesh",
+    "make_object",
+    "make_scene",
     "observe",
     "onboard",
+    "onboard_photo",
     "pad_templates",
+    "read_camera",
+    "read_depth",
+    "read_mask",
+    "read_results",
+    "read_rgb",
     "save",
+    "save_mesh",
+    "score",
+    "write_results",
 ]
 
 # Where each of them is.
 _HOMES = {
+    "bop.dataset": ("Dataset",),
+    "bop.evaluation": ("evaluate",),
+    "bop.results": (
+        "read_results",
+        "write_results",
+    ),
+    "bop.scoring.scores": ("score",),
     "config": (
         "AlignConfig",
         "ConfidenceConfig",
@@ -73,16 +116,46 @@ _HOMES = {
         "RefineConfig",
         "ScoreConfig",
     ),
-    "estimation.features": ("describe", "observe"),
-    "inference.drawing": ("draw",),
-    "inference.frames": ("frame",),
+    "estimation.features": (
+        "describe",
+        "observe",
+    ),
+    "estimation.pipeline": ("estimate",),
+    "files.cameras.intrinsics": ("Intrinsics",),
+    "files.cameras.reading": ("read_camera",),
+    "files.images.depth": ("read_depth",),
+    "files.images.masks": ("read_mask",),
+    "files.images.opening": ("read_rgb",),
+    "files.meshes.loading": ("load_mesh",),
+    "files.meshes.mesh": ("Mesh",),
+    "files.meshes.saving": ("save_mesh",),
     "files.objects.loading": ("load",),
     "files.objects.saving": ("save",),
-    "inference.batching": ("compact", "pad_templates"),
-    "onboarding.mesh": ("onboard",),
     "files.weights.encoder": ("load_encoder",),
-    "estimation.pipeline": ("estimate",),
-    "records": ("Camera", "Patches", "PoseEstimate", "Query", "Surface", "Templates", "View"),
+    "inference.batching": (
+        "compact",
+        "pad_templates",
+    ),
+    "inference.drawing": ("draw",),
+    "inference.estimator": ("Estimator",),
+    "inference.frames": (
+        "frame",
+        "frame_turned",
+    ),
+    "onboarding.mesh": ("onboard",),
+    "onboarding.photo": ("onboard_photo",),
+    "records": (
+        "Camera",
+        "Patches",
+        "PoseEstimate",
+        "Query",
+        "Surface",
+        "Templates",
+        "View",
+    ),
+    "synthetic.degradation": ("degrade",),
+    "synthetic.objects": ("make_object",),
+    "synthetic.scenes": ("make_scene",),
     "transforms": ("Similarity",),
 }
 _HOME = {name: f"ipjax.{module}" for module, names in _HOMES.items() for name in names}

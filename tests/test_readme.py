@@ -1,6 +1,7 @@
 """The README's Python runs as it stands there, and its commands exist."""
 
 import functools
+import importlib
 import json
 import re
 from pathlib import Path
@@ -101,6 +102,22 @@ def test_commands_exist():
             parser.parse_args(words[1:])
         except SystemExit as refusal:
             pytest.fail(f"the command line refuses {' '.join(words)!r} ({refusal.code})")
+
+
+def test_names_exist_and_every_public_one_is_listed():
+    text = README.read_text()
+    for dotted in set(re.findall(r"\bipjax(?:\.[a-zA-Z_]\w*)+", text)) - {"ipjax.NAME"}:
+        if dotted.split(".")[-1] in ("html", "ipjax"):  # names of files
+            continue
+        value = ipjax
+        for part in dotted.split(".")[1:]:
+            try:
+                value = getattr(value, part)
+            except AttributeError:
+                value = importlib.import_module(f"{value.__name__}.{part}")
+    table = text[text.index("## Names") : text.index("## Other ways in and out")]
+    listed = set(re.findall(r"`(\w+)`", table))
+    assert set(ipjax.__all__) <= listed, f"README does not list {set(ipjax.__all__) - listed}"
 
 
 def test_links_lead_somewhere():
