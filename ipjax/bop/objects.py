@@ -94,7 +94,7 @@ def prepare_objects(
     for count, obj_id in enumerate(sorted(wanted)):
         source = Path(meshes[obj_id]) if obj_id in meshes else dataset.model_path(obj_id, "models")
         alignment = read_alignment(alignments[obj_id]) if obj_id in alignments else None
-        key = hash_origin(source, encoder, config, quality, seed)
+        key = hash_origin(source, encoder, config, quality=quality, seed=seed)
         if folder is not None and obj_id in meshes:  # the file with its number is of the model
             path = folder / "meshes" / f"obj_{obj_id:06d}_{key}.ipjax"
         elif folder is None:
@@ -133,9 +133,9 @@ def hash_origin(
     source: Path,
     encoder: Encoder,
     config: OnboardConfig,
+    *,
     quality: int,
     seed: int,
-    *,
     hash_code: Callable[..., str] = hash_executed,
 ) -> str:
     """All that an object file is made of, the code included, in sixteen digits."""

@@ -6,15 +6,15 @@ On the host, in NumPy: what is matched depends on what has been matched before.
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 
 def match_poses(
     pose_errors: Float[np.ndarray, "e g"],
     scores: Float[np.ndarray, "e"],
     threshold: float,
-    valid: np.ndarray | None = None,
-) -> np.ndarray:
+    valid: Bool[np.ndarray, "g"] | None = None,
+) -> Int[np.ndarray, "e"]:
     """Which ground truth [e] each estimate gets at a threshold, −1 = none: greedily by falling score, one to one, the
     smallest error below the threshold (strictly) among valid truths that are still free (pose_matching.py:9-92)."""
     count, truths = pose_errors.shape
@@ -29,7 +29,7 @@ def match_poses(
     return matched
 
 
-def average_precision(scores: np.ndarray, correct: np.ndarray, count: int) -> float:
+def average_precision(scores: Float[np.ndarray, "e"], correct: Bool[np.ndarray, "e"], count: int) -> float:
     """Precision interpolated at 101 recalls, averaged (COCO's form; score.py:12-53). ``count`` = all true instances."""
     if count == 0 or len(scores) == 0:
         return 0.0
@@ -41,7 +41,9 @@ def average_precision(scores: np.ndarray, correct: np.ndarray, count: int) -> fl
 
 
 def detection_precision(
-    images: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], count: int, threshold: float
+    images: Sequence[tuple[Float[np.ndarray, "_ _"], Float[np.ndarray, "_"], Bool[np.ndarray, "_"]]],
+    count: int,
+    threshold: float,
 ) -> float:
     """Average precision of one object: for each image errors [e, g], scores [e], and which truths are valid [g].
 

@@ -151,9 +151,9 @@ def add_s(
     points: Float[A, "n 3"],
     truth: Similarity[A],
     estimate: Similarity[A],
+    nearest: Callable[[Any], Any] | None = None,
     *,
     block: int = 512,
-    nearest: Callable[[Any], Any] | None = None,
 ) -> Float[A, ""]:
     """Average distance of the vertices in the true pose to the NEAREST vertex in the estimated pose: ADD-S, or ADI.
 

@@ -109,7 +109,7 @@ def test_the_key_of_an_object_file(tmp_path):
     mesh = dataclasses.replace(triangle, uv=np.eye(3)[:, :2], texture=np.full((4, 4, 3), 90, np.uint8))
     save_mesh(mesh, tmp_path / "a.obj")
     source, config, encoder = tmp_path / "a.obj", OnboardConfig(), encoder_called("an encoder")
-    key = lambda **more: hash_origin(source, encoder, more.pop("config", config), more.pop("quality", 0), 0, **more)
+    key = lambda **more: hash_origin(source, encoder, more.pop("config", config), **{"quality": 0, "seed": 0, **more})
     first = key()
     assert first == key() and len(first) == 16
     assert key(hash_code=lambda *_: "other") != first

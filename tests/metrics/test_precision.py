@@ -19,4 +19,4 @@ def test_average_precision_by_hand():
     assert average_precision(np.array([0.9, 0.8]), np.array([True, True]), 2) == 1.0
     # Half of the truths, found first: precision 1 at the recalls 0 … 0.5 (51 of 101).
     assert average_precision(np.array([0.9, 0.8]), np.array([True, False]), 2) == pytest.approx(51 / 101)
-    assert average_precision(np.array([]), np.array([]), 3) == 0.0
+    assert average_precision(np.array([]), np.array([], bool), 3) == 0.0

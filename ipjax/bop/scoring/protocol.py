@@ -41,6 +41,7 @@ class ScoredTarget:
     vsd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))  # [e, g, t]
 
     def pairs(self) -> Iterator[tuple[int, int]]:
+        """The indices of every estimate with every ground truth."""
         return ((e, g) for e in range(len(self.estimates)) for g in range(len(self.truths)))
 
 
@@ -181,6 +182,7 @@ class Protocol:
         self.notes.append(message)
 
     def collect(self, rows: list[ResultRow]) -> list[ScoredTarget]:
+        """Each target of the data set with its ground truths and with the estimates that these rows give for it."""
         estimates: dict[tuple[int, int, int], list[ResultRow]] = {}
         for row in rows:
             estimates.setdefault((row.scene_id, row.im_id, row.obj_id), []).append(row)

@@ -115,6 +115,7 @@ def count_right_sizes(targets: list[ScoredTarget], instances: list[Instance]) ->
 
 
 def find_medians(instances: list[Instance]) -> dict[str, float]:
+    """Median errors of rotation, translation and size over the instances that have an estimate; empty without any."""
     if not instances:
         return {}
     medians = {
@@ -128,6 +129,7 @@ def find_medians(instances: list[Instance]) -> dict[str, float]:
 
 
 def summarise_distances(instances: list[Instance], protocol: Protocol) -> dict[str, float]:
+    """Areas under the accuracy curves of ADD and ADD-S, and the shares of instances below a tenth of the diameter."""
     add, add_s = np.array([i.add for i in instances]), np.array([i.add_s for i in instances])
     either = np.array([i.add_s if i.obj_id in protocol.symmetric else i.add for i in instances])
     diameters = np.array([protocol.infos[i.obj_id].diameter for i in instances])
