@@ -22,7 +22,6 @@ hypothesis.settings.register_profile("thorough", max_examples=300, deadline=None
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
-GOLDEN = Path(__file__).resolve().parent / "golden"
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import functools
 
 import numpy as np
-from conftest import GOLDEN
+from builders.golden import GOLDEN
 
 from ipjax.networks.triposr.config import TripoSRConfig, VisionConfig
 from ipjax.networks.triposr.model import TripoSR

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import GOLDEN
+from builders.golden import GOLDEN
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.golden import GOLDEN
 from builders.tiny_triposr import TINY, make_model, read_golden, read_weights
-from conftest import GOLDEN
 from flax import nnx
 from golden.make_triposr import cut
 

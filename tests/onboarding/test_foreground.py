@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import GOLDEN
+from builders.golden import GOLDEN
 from golden.make_triposr import digest
 from PIL import Image
 

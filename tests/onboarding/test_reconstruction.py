@@ -7,8 +7,8 @@ import jaxtyping
 import numpy as np
 import pytest
 import trimesh
+from builders.golden import GOLDEN
 from builders.tiny_triposr import TINY, make_model, read_golden
-from conftest import GOLDEN
 from flax import nnx
 from golden.make_triposr import unpack
 
