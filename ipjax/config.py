@@ -18,7 +18,7 @@ class DescribeConfig(eqx.Module):
     """From a view to its patches."""
 
     cover: float = 0.2  # least share of a patch that must be object with a depth
-    spread: float = 0.05  # depths farther than this share of their patch's median belong to something else
+    spread: float = 0.05  # depths that differ from their patch's median by a larger share of it are left out
 
 
 class MatchConfig(eqx.Module):
@@ -32,7 +32,7 @@ class MatchConfig(eqx.Module):
     memory_bytes: int = _static(64 * 2**20, least=1)  # bound on the similarities held at once
     shortlist: int | None = _static(
         None, least=1
-    )  # templates searched patch by patch, the likeliest by pooled features; all
+    )  # templates that are searched patch by patch, those most similar by pooled features; None = all
 
 
 class AlignConfig(eqx.Module):
@@ -58,14 +58,14 @@ class RefineConfig(eqx.Module):
     silhouette: int = _static(96)  # points on the mask's border that the silhouette is fitted to
     silhouette_reach: float = 0.1  # silhouettes farther from the border than this are dropped, in diameters
     silhouette_width: float = 0.02  # of the robust loss on the distance between them, in diameters
-    silhouette_weight: float = 1.6  # beside 1 for each direction of the depth association
-    settle: bool = _static(True)  # in the end allow for a mesh that is wrong (``refinement.settle``)
-    strain: float = 0.05  # standard deviation of its proportions
-    gain: float = 0.2  # share of the cost that changing them must save, or they count as right
-    forgiveness: float = 4.0  # the width of the losses beside how far the surface is off the depth
-    pairs: int = _static(64)  # best pairs of each view that hold an uneven surface in its place
+    silhouette_weight: float = 1.6  # relative to 1 for each direction of the depth association
+    settle: bool = _static(True)  # at the end refine once more, for errors of the mesh (``refinement.settle``)
+    strain: float = 0.05  # standard deviation of errors in the mesh's proportions, a share
+    gain: float = 0.2  # least share of the cost that changed proportions must save, else they are kept
+    forgiveness: float = 4.0  # width of the losses relative to the standard deviation of the mesh's surface
+    pairs: int = _static(64)  # best pairs of each view, which constrain the pose of an uneven surface
     pair_width: float = 0.08  # of the robust loss on their distance, in diameters: about one patch
-    pair_weight: float = 4.0  # of all of them beside 1 for each direction of the depth association
+    pair_weight: float = 4.0  # of all pairs together, relative to 1 for each direction of the depth association
 
 
 class ScoreConfig(eqx.Module):
@@ -73,15 +73,15 @@ class ScoreConfig(eqx.Module):
 
     ranking: Literal["inliers", "render"] = _static("render")
     resolution: int = _static(56, least=1)  # pixels on a side of the depth comparison
-    views: int = _static(5)  # templates that lend a hypothesis their features
+    views: int = _static(5)  # templates, nearest in viewpoint, whose features are compared
     spread: float = 0.52  # how fast their weight falls with the angle to the hypothesis, rad (30°)
     power: float = 2.0  # of the agreement with the templates' features; that of the object drawn has 1
     tolerance: float = 0.05  # depth difference that still agrees, in diameters
-    drawn: int = _static(6)  # best candidates drawn and compared again, where the encoder is given; 0 = none
+    drawn: int = _static(6)  # best candidates that are drawn and compared again, if there is an encoder; 0 = none
     depth_power: float = 0.5  # of the depth agreement of a drawn candidate
-    colour_weight: float = 0.5  # logarithm of what the correlation of colours can add to a drawn candidate
-    guess: float = 0.5  # agreement in features that guessed surface of a drawn candidate counts as, whatever it is
-    apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters are drawn once
+    colour_weight: float = 0.5  # a drawn candidate's score is multiplied by exp(this · (correlation − 1))
+    guess: float = 0.5  # agreement in features assumed of surface that is guessed, for drawn candidates
+    apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters count as one
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
 
@@ -90,9 +90,9 @@ class ConfidenceConfig(eqx.Module):
 
     drawn: tuple[float, ...] = (2.04, 0.94, 1.15, 2.37, 5.92, 0.0, -2.04)  # see ``confidence.probability``
     undrawn: tuple[float, ...] = (7.84, 1.51, 6.84, 0.0, 0.0, 1.23, -3.77)  # where no candidate was drawn
-    least: float = 0.5  # confidence below which the object is not here, or not seen well enough
-    independent: float = 9.84  # independent residuals of refinement
-    pair_share: float = 0.0239  # of the pairs that are independent
+    least: float = 0.5  # confidence below which ``present`` is False
+    independent: float = 9.84  # number of independent residuals of refinement
+    pair_share: float = 0.0239  # share of the pairs that are independent
     tie: float = 0.05  # how fast an alternative's weight falls with the share by which its score is lower; not fitted
 
 
@@ -107,7 +107,7 @@ class Config(eqx.Module):
 
     @staticmethod
     def fast() -> "Config":
-        """Fewer hypotheses, none tried turned, three drawn, the mesh trusted: less sure which way round things are."""
+        """Fewer hypotheses, none of them turned, three drawn, no ``settle``: confuses front and back more often."""
         return Config(
             match=MatchConfig(views=6),
             refine=RefineConfig(steps=8, settle=False),

@@ -6,7 +6,7 @@ from typing import Any
 
 
 def bar(items: Iterable | None = None, **settings: Any) -> Any:
-    """``tqdm.tqdm``; where the error stream is no terminal it tells something every half minute only."""
+    """``tqdm.tqdm``; where the error stream is no terminal, it prints only every half minute."""
     from tqdm import tqdm
 
     if not sys.stderr.isatty():

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ipjax.transforms import Similarity
 
-UNNAMED = "unnamed"  # the identity of an encoder that nobody named
+UNNAMED = "unnamed"  # the identity of an encoder that was given none
 
 
 class Camera(eqx.Module):
@@ -53,7 +53,7 @@ class Patches(eqx.Module):
     points: Float[Array, "*b p 3"]  # in the owner's frame: object (model units) or camera (metres)
     grid: Float[Array, "*b p 2"]  # (column, row), in patches
     valid: Bool[Array, "*b p"]  # on the object, with a depth
-    # Who described it: the encoder's ``identity``, its weights' hash included; None = one without, never compared.
+    # The ``identity`` of the encoder that described the view, with its weights' hash; None = not known, not compared.
     encoder: str | None = eqx.field(static=True, default=None)
 
 
@@ -66,7 +66,7 @@ class Surface(eqx.Module):
 
 
 class Appearance(eqx.Module):
-    """A dense sample of the surface with its colours: the object as it can be drawn again at any pose."""
+    """A dense sample of the surface with its colours, from which the object is drawn at any pose."""
 
     points: Float[Array, "*b m 3"]  # model units
     normals: Float[Array, "*b m 3"]  # unit, outwards
@@ -74,16 +74,16 @@ class Appearance(eqx.Module):
 
 
 class Templates(eqx.Module):
-    """The object, ready to be found: rendered views as patches, their poses, and its surface.
+    """An onboarded object: rendered views as patches, their poses, and its surface.
 
     Points are in the normalised object frame, so one model unit is one diameter and the scale of an estimated
     ``camera_from_object`` is the object's diameter in metres.
     """
 
     patches: Patches  # leading axes *b v; features centred: see ``ipjax.estimation.features.centre``
-    mean: Float[Array, "*b c"]  # of the object's features, taken out of every one of them
-    norm: Float[Array, "*b v p"]  # what was left of each; raw feature = norm · feature (@ basis) + mean
-    seen: Float[Array, "*b v p"]  # how much of the patch's surface was seen (1) or guessed (0)
+    mean: Float[Array, "*b c"]  # of the object's features, subtracted from each of them
+    norm: Float[Array, "*b v p"]  # of each remainder; raw feature = norm · feature (@ basis) + mean
+    seen: Float[Array, "*b v p"]  # share of the patch's surface that was seen, not guessed
     camera_from_object: Similarity  # leading axes *b v; scale 1, model units
     camera: Camera  # of each template, leading axes *b v; pixels of the rendered image
     surface: Surface
@@ -131,9 +131,9 @@ class Agreement(eqx.Module):
 
     depth: Float[Array, "*b"]  # share of what is seen whose depth agrees
     features: Float[Array, "*b"]  # cosine of the nearest templates' patches, carried into the query
-    drawn: Float[Array, "*b"]  # cosine of the object drawn there and described; 1 where it was not drawn
-    colour: Float[Array, "*b"]  # correlation of its colours drawn and seen, in [-1, 1]; 0 where it was not drawn
-    seen: Float[Array, "*b"]  # share of the surface it shows that its reconstruction saw; 1 for scans
+    drawn: Float[Array, "*b"]  # cosine of the features of the object drawn at the pose; 1 where it was not drawn
+    colour: Float[Array, "*b"]  # correlation of colours drawn and observed, in [-1, 1]; 0 where it was not drawn
+    seen: Float[Array, "*b"]  # share of the visible surface that its reconstruction saw, not guessed; 1 for scans
     rival: Float[Array, "*b"]  # score of the best pose that differs from this one, as a share of this one's
 
 

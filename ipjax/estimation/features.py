@@ -32,7 +32,7 @@ def describe(
     Raises:
       ValueError: the image is not a whole number of patches on either side.
     """
-    view, there = finite_view(view)
+    view, has_camera = finite_view(view)
     features = encoder(view.rgb)
     rows, columns, channels = features.shape
     height, width = view.depth.shape
@@ -44,16 +44,16 @@ def describe(
         features=features.reshape(-1, channels),
         points=points,
         grid=grid.reshape(-1, 2),
-        valid=(cover >= config.cover) & there,
+        valid=(cover >= config.cover) & has_camera,
         encoder=identity_of(encoder),
     )
     return finite_patches(patches)
 
 
 def identity_of(encoder: object) -> str | None:
-    """What tells an encoder from others: its ``identity``, or None where it has none.
+    """The ``identity`` of an encoder, by which its features are known from those of others; None where it has none.
 
-    Whoever writes an encoder of their own may give it one: any text that changes with its weights and settings.
+    Encoders of your own may have one, too: any text that changes with their weights and settings.
     """
     identity = getattr(encoder, "identity", None)
     return identity if isinstance(identity, str) and identity not in ("", UNNAMED) else None
@@ -74,9 +74,9 @@ def observe(
 def centre(
     patches: Patches,
 ) -> tuple[Patches, Float[Array, "c"], Float[Array, "v p"]]:
-    """Take the mean of an object's features out of every one of them, and make what is left unit vectors again.
+    """Subtract the mean of an object's features from each of them, and normalise the remainders.
 
-    All patches of one object share most of their feature; what tells them apart is the rest.
+    All patches of one object have most of their feature in common; the remainder is what distinguishes them.
 
     Args:
       patches: of all templates, ``v p``; the mean is over the valid ones.
@@ -130,7 +130,7 @@ def object_features(features: Float[Array, "*b c"], templates: Templates) -> Flo
 def centre_on(
     features: Float[Array, "*b c"], mean: Float[Array, "c"]
 ) -> tuple[Float[Array, "*b c"], Float[Array, "*b"]]:
-    """Unit vectors of what is left of features without ``mean``, and its norms; nothing left gives zeros."""
+    """Features less ``mean``, as unit vectors, and the norms of the remainders; a remainder of zero stays zero."""
     rest = features - mean
     norm = root(jnp.sum(rest * rest, axis=-1))
     return rest / jnp.maximum(norm, 1e-9)[..., None], norm

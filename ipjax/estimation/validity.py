@@ -1,9 +1,9 @@
-"""Numbers that are not numbers: whatever is not finite is absent; what cannot be absent leaves the answer undetermined.
+"""NaN and infinity: what is not finite is marked as absent; where it cannot be absent, there is no estimate.
 
 A depth camera writes NaN and infinity where it saw nothing, an undistorted image has borders without a colour, a
-network can overflow. Each function gives a record in which such places hold harmless numbers and are marked as absent.
-The marks are the records' own (`valid`, `mask`, depth 0), so nobody after them needs to ask again. Gradients with
-respect to what is left are finite.
+network can overflow. Each function returns a record in which such places hold finite numbers and are marked as absent
+by the record's own marks (`valid`, `mask`, depth 0), so that later stages need not check again. Gradients with respect
+to the remaining numbers are finite.
 """
 
 import dataclasses
@@ -27,24 +27,24 @@ def finite_view(view: View) -> tuple[View, Bool[Array, "*b"]]:
     """
     coloured = jnp.all(jnp.isfinite(view.rgb), axis=-1)
     measured = jnp.isfinite(view.depth) & (view.depth > 0)
-    camera, there = _finite_camera(view.camera)
+    camera, has_camera = _finite_camera(view.camera)
     rgb, depth = jnp.where(coloured[..., None], view.rgb, 0), jnp.where(measured, view.depth, 0)
-    return View(rgb, depth, view.mask & coloured, camera), there
+    return View(rgb, depth, view.mask & coloured, camera), has_camera
 
 
 def finite_patches(patches: Patches) -> Patches:
     """Patches of which those with a feature, point or place in the grid that is not finite are not valid."""
     fields = {name: getattr(patches, name) for name in ("features", "points", "grid")}
-    known = {name: _finite_rows(value) for name, value in fields.items()}
-    kept = {name: jnp.where(known[name][..., None], value, 0) for name, value in fields.items()}
-    valid = patches.valid & known["features"] & known["points"] & known["grid"]
+    finite = {name: _finite_rows(value) for name, value in fields.items()}
+    kept = {name: jnp.where(finite[name][..., None], value, 0) for name, value in fields.items()}
+    valid = patches.valid & finite["features"] & finite["points"] & finite["grid"]
     return dataclasses.replace(patches, **kept, valid=valid)
 
 
 def finite_query(query: Query) -> tuple[Query, Bool[Array, "*b"]]:
     """A query of finite numbers, and whether it has a camera: see :func:`finite_view`, :func:`finite_patches`."""
-    view, there = finite_view(query.view)
-    return Query(finite_patches(query.patches), view), there
+    view, has_camera = finite_view(query.view)
+    return Query(finite_patches(query.patches), view), has_camera
 
 
 def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
@@ -54,23 +54,23 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
     finite repeats one that is, without a normal: it faces no camera, as with ``ipjax.pad_templates``.
 
     Returns:
-      The templates, and whether the object is known: some point of its surface, and its axes and its features' mean and
-      basis wholly.
+      The templates, and whether the object is usable: it has a finite surface point, and its axes, mean and basis are
+      finite throughout.
     """
     patches, pose = templates.patches, templates.camera_from_object
-    camera, placed = _finite_camera(templates.camera)
-    placed = placed & _finite_pose(pose)
-    here = _finite_rows(patches.features) & _finite_rows(patches.points) & _finite_rows(patches.grid)
-    here = patches.valid & here & jnp.isfinite(templates.norm) & placed[:, None]
+    camera, has_camera = _finite_camera(templates.camera)
+    placed = has_camera & _finite_pose(pose)
+    finite = _finite_rows(patches.features) & _finite_rows(patches.points) & _finite_rows(patches.grid)
+    valid = patches.valid & finite & jnp.isfinite(templates.norm) & placed[:, None]
     shown = dataclasses.replace(
         patches,
-        points=jnp.where(here[..., None], patches.points, 0),
+        points=jnp.where(valid[..., None], patches.points, 0),
         grid=jnp.where(_finite_rows(patches.grid)[..., None], patches.grid, 0),
-        valid=here,
+        valid=valid,
     )
-    surface, solid = _finite_points(templates.surface)
-    whole = [templates.mean, templates.axes, *([] if templates.basis is None else [templates.basis])]
-    known = jnp.stack([solid, *(jnp.all(jnp.isfinite(x)) for x in whole)])
+    surface, has_points = _finite_points(templates.surface)
+    needed = [templates.mean, templates.axes, *([] if templates.basis is None else [templates.basis])]
+    usable = jnp.stack([has_points, *(jnp.all(jnp.isfinite(x)) for x in needed)])
     kept = dataclasses.replace(
         templates,
         patches=shown,
@@ -85,13 +85,13 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
         basis=None if templates.basis is None else _or_zero(templates.basis),
         appearance=None if templates.appearance is None else _finite_points(templates.appearance)[0],
     )
-    return kept, jnp.all(known)
+    return kept, jnp.all(usable)
 
 
 def finite_estimate(found: PoseEstimate) -> PoseEstimate:
-    """An estimate of finite numbers: one that is not is no success, and has neither confidence nor presence.
+    """An estimate of finite numbers; without success, confidence and presence where it was not finite.
 
-    The last guard, against settings that make no sense: what comes from finite records is finite.
+    Estimates from finite records are finite, unless the settings make no sense: this is the last guard against those.
     """
     uncertainty = found.confidence, found.covariance, found.scale_std, found.ambiguity
     own = found.camera_from_object, *uncertainty, found.agreement, found.rmse
@@ -114,19 +114,19 @@ def finite_estimate(found: PoseEstimate) -> PoseEstimate:
 
 
 def _finite_camera(camera: Camera) -> tuple[Camera, Bool[Array, "*b"]]:
-    there = jnp.all(jnp.isfinite(camera.focal) & (camera.focal > 0) & jnp.isfinite(camera.centre), axis=-1)
-    keep = there[..., None]
-    return Camera(jnp.where(keep, camera.focal, 1), jnp.where(keep, camera.centre, 0)), there
+    finite = jnp.all(jnp.isfinite(camera.focal) & (camera.focal > 0) & jnp.isfinite(camera.centre), axis=-1)
+    keep = finite[..., None]
+    return Camera(jnp.where(keep, camera.focal, 1), jnp.where(keep, camera.centre, 0)), finite
 
 
 def _finite_points(record: _Points) -> tuple[_Points, Bool[Array, ""]]:
     fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     rows = [jnp.isfinite(x) if x.ndim == 1 else _finite_rows(x) for x in fields.values()]
-    here = jnp.all(jnp.stack(rows), axis=0)
-    first = jnp.where(jnp.any(here), record.points[jnp.argmax(here)], 0)
-    kept = {name: jnp.where(here if x.ndim == 1 else here[:, None], x, 0) for name, x in fields.items()}
-    kept["points"] = jnp.where(here[:, None], record.points, first)
-    return type(record)(**kept), jnp.any(here)
+    finite = jnp.all(jnp.stack(rows), axis=0)
+    first = jnp.where(jnp.any(finite), record.points[jnp.argmax(finite)], 0)
+    kept = {name: jnp.where(finite if x.ndim == 1 else finite[:, None], x, 0) for name, x in fields.items()}
+    kept["points"] = jnp.where(finite[:, None], record.points, first)
+    return type(record)(**kept), jnp.any(finite)
 
 
 def _finite_pose(pose: Similarity) -> Bool[Array, "*b"]:

@@ -1,4 +1,4 @@
-"""What made a file: a hash of the source that was executed, so that nothing made by another state is taken for its own.
+"""A hash of the source code that made a file, so that files of another state of the code are not mistaken for current.
 
 Modules are found by reading their imports, at any depth and also inside functions; nothing is imported for it.
 """

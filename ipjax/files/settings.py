@@ -1,4 +1,4 @@
-"""Configurations from names, files and words such as ``match.views=4``, checked, and back to plain JSON."""
+"""Configurations from presets, files and assignments such as ``match.views=4``, checked, and back to plain JSON."""
 
 import dataclasses
 import difflib
@@ -15,7 +15,7 @@ from ipjax.config import PRESETS, Config
 from ipjax.files.storage.parsing import read_json
 
 ConfigT = TypeVar("ConfigT", bound=eqx.Module)
-_MISFIT = object()  # what no field can hold
+_INVALID = object()  # returned for a value that a field cannot hold
 _YES, _NO = ("true", "yes", "on"), ("false", "no", "off")
 
 
@@ -36,7 +36,7 @@ def read_config(name: str | Path, changes: Iterable[str] = ()) -> Config:
     start = entry.pop("from", "default")
     if start not in PRESETS:
         raise ValueError(f"{path}: 'from' is one of {', '.join(PRESETS)}, not {start!r}")
-    return override(changes, _replaced(Config.named(start), entry, str(path)))
+    return override(changes, _replace_fields(Config.named(start), entry, str(path)))
 
 
 def override(changes: Iterable[str], config: ConfigT) -> ConfigT:
@@ -56,7 +56,7 @@ def override(changes: Iterable[str], config: ConfigT) -> ConfigT:
         name, text = name.strip(), text.strip()
         if not (name and equals and text):
             raise ValueError(f"{change!r}: give FIELD=VALUE, for instance {_example(config)}")
-        config = _with(config, name.split("."), name, text)
+        config = _replace_field(config, name.split("."), name, text)
     return config
 
 
@@ -85,7 +85,7 @@ def _example(config: eqx.Module) -> str:
     return f"{name}={names[name]}"
 
 
-def _with(config: Any, path: list[str], whole: str, text: str) -> Any:
+def _replace_field(config: Any, path: list[str], whole: str, text: str) -> Any:
     """The configuration with the field at the end of ``path`` replaced by what ``text`` says."""
     known = {field.name: field for field in dataclasses.fields(config)}
     if path[0] not in known:
@@ -94,19 +94,21 @@ def _with(config: Any, path: list[str], whole: str, text: str) -> Any:
     if isinstance(old, eqx.Module):
         if len(path) == 1:
             raise ValueError(f"{whole} is a group of settings: name one of them, for instance {whole}.{_example(old)}")
-        new = _with(old, path[1:], whole, text)
+        new = _replace_field(old, path[1:], whole, text)
     elif len(path) > 1:
         raise ValueError(f"{whole}: {whole.removesuffix('.' + '.'.join(path[1:]))} is one value, not a group")
     else:
         field = known[path[0]]
-        new = _fitted(_parsed(text, field.type), field, old)
-        if new is _MISFIT:
-            raise ValueError(f"{whole}: {_expected(field, old)} is expected, for instance {_told(old)}, not {text!r}")
+        new = _convert(_parse_value(text, field.type), field, old)
+        if new is _INVALID:
+            raise ValueError(
+                f"{whole}: {_describe_kind(field, old)} is expected, for instance {_as_text(old)}, not {text!r}"
+            )
     return dataclasses.replace(config, **{path[0]: new})
 
 
 def _unknown(config: eqx.Module, path: list[str], whole: str) -> str:
-    """What to say of a field that is not there: those near it, here or in any other group."""
+    """The message for a field that does not exist, with those of similar names, in this group or another."""
     before = whole.removesuffix(".".join(path))
     groups = [f.name for f in dataclasses.fields(config) if isinstance(getattr(config, f.name), eqx.Module)]
     here = [name for name, _ in list_fields(config)]
@@ -123,15 +125,15 @@ def _unknown(config: eqx.Module, path: list[str], whole: str) -> str:
     return f"there is no setting {whole!r}; near it: {', '.join(before + name for name in near)}"
 
 
-def _parsed(text: str, hint: Any) -> Any:
-    """The value that a text stands for, or the text itself where it is not of that kind."""
+def _parse_value(text: str, hint: Any) -> Any:
+    """The value that a text stands for, or the text itself where it cannot be parsed as this type."""
     kinds = _kinds(hint)
     if type(None) in kinds and text.lower() == "none":
         return None
     if bool in kinds and text.lower() in (*_YES, *_NO):
         return text.lower() in _YES
     if any(typing.get_origin(kind) is tuple for kind in kinds):
-        return [_parsed(part.strip(), float) for part in text.strip("[]()").split(",")]
+        return [_parse_value(part.strip(), float) for part in text.strip("[]()").split(",")]
     for kind in (int, float):
         if kind in kinds:
             try:
@@ -141,7 +143,8 @@ def _parsed(text: str, hint: Any) -> Any:
     return text
 
 
-def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:
+def _replace_fields(config: Any, entry: Mapping[str, Any], where: str) -> Any:
+    """The configuration with the fields of a JSON object replaced; ``where`` begins messages."""
     known = {field.name: field for field in dataclasses.fields(config)}
     changed = {}
     for name, value in entry.items():
@@ -151,13 +154,13 @@ def _replaced(config: Any, entry: Mapping[str, Any], where: str) -> Any:
         if isinstance(old, eqx.Module):
             if not isinstance(value, Mapping):
                 raise ValueError(f"{where}: {name} holds settings of its own")
-            changed[name] = _replaced(old, value, f"{where}, {name}")
+            changed[name] = _replace_fields(old, value, f"{where}, {name}")
         else:
-            changed[name] = _fitted(value, known[name], old)
-            if changed[name] is _MISFIT:
+            changed[name] = _convert(value, known[name], old)
+            if changed[name] is _INVALID:
                 raise ValueError(
-                    f"{where}: {name} is {_told(old)} by default; {_told(value)} is of another kind: "
-                    f"{_expected(known[name], old)} is expected"
+                    f"{where}: {name} is {_as_text(old)} by default; {_as_text(value)} is of another kind: "
+                    f"{_describe_kind(known[name], old)} is expected"
                 )
     return dataclasses.replace(config, **changed)
 
@@ -168,7 +171,7 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
 
 
 def _number(value: Any) -> float | None:
-    """A number, finite or not, also where it is written as `describe_config` does; None for anything else."""
+    """A number, finite or not, or "inf" and "-inf" as `describe_config` writes them; None for anything else."""
     if value in ("inf", "-inf"):
         return float(value)
     if isinstance(value, bool) or not isinstance(value, int | float):
@@ -176,8 +179,8 @@ def _number(value: Any) -> float | None:
     return float(value) if abs(value) < 1e300 or value in (math.inf, -math.inf) else None
 
 
-def _fitted(value: Any, field: dataclasses.Field, old: Any) -> Any:
-    """The value as this field holds it, or `_MISFIT`."""
+def _convert(value: Any, field: dataclasses.Field, old: Any) -> Any:
+    """The value in the type of this field, or `_INVALID`."""
     for kind in _kinds(field.type):
         if typing.get_origin(kind) is tuple:
             numbers = [_number(x) for x in value] if isinstance(value, list) else [None]
@@ -194,10 +197,10 @@ def _fitted(value: Any, field: dataclasses.Field, old: Any) -> Any:
                 return value
         elif type(value) is kind:
             return value
-    return _MISFIT
+    return _INVALID
 
 
-def _told(value: Any) -> str:
+def _as_text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, tuple | list) else repr(value)
 
 
@@ -206,14 +209,15 @@ def _least(field: dataclasses.Field) -> int:
     return field.metadata.get("least", 0)
 
 
-def _expected(field: dataclasses.Field, old: Any) -> str:
+def _describe_kind(field: dataclasses.Field, old: Any) -> str:
+    """What a field holds, in words."""
     names = {bool: "true or false", int: f"a whole number from {_least(field)}", float: "a number", type(None): "none"}
-    told = []
+    kinds = []
     for kind in _kinds(field.type):
         if typing.get_origin(kind) is tuple:
-            told.append(f"a list of {len(old)} numbers")
+            kinds.append(f"a list of {len(old)} numbers")
         elif typing.get_origin(kind) is typing.Literal:
-            told.append(" or ".join(map(repr, typing.get_args(kind))))
+            kinds.append(" or ".join(map(repr, typing.get_args(kind))))
         else:
-            told.append(names[kind])
-    return " or ".join(told)
+            kinds.append(names[kind])
+    return " or ".join(kinds)

@@ -1,1 +1,1 @@
-"""One frame in, one answer out: cutting the frame, running the graph, telling and drawing what it found."""
+"""From a frame to an estimate on the host: cropping the frame, running the graph, reporting and drawing the result."""

@@ -12,11 +12,11 @@ from ipjax.records import Templates
 
 
 def compact(templates: Templates, *, multiple: int = 32) -> Templates:
-    """Templates with fewer patches each, and the same answers: most of an image is background.
+    """Templates without most of their background patches; estimates stay the same.
 
-    The valid patches come first, in their old order, then as many others as make all templates alike: a multiple of
-    ``multiple``. At least one of the others stays, the last of the grid unless that is valid, so that ``grid`` still
-    tells how large it is. To be done once, before ``estimate``; an object file keeps every patch.
+    The valid patches come first, in their old order, then at least one invalid one, as many as give all templates the
+    same number, a multiple of ``multiple``. The last patch of the grid always stays, valid or not, so that the size of
+    the grid can be read off ``grid``. To be done once, before ``estimate``; an object file keeps every patch.
 
     Raises:
         ValueError: the templates are no single object's, or ``multiple`` is not positive.
@@ -43,10 +43,10 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     """Several objects' templates padded to one size and stacked, so that ``jax.vmap(estimate, …)`` takes them at once.
 
     What is added is absent. Patches are not valid. Views repeat the last one's pose and camera without a valid patch:
-    they rank behind all others and lend no features. Surface and appearance points repeat the first one without a
-    normal: they face no camera, so nothing is fitted to them and they are not drawn, and no outline is wider for them.
-    An object gives the same answer as alone, up to rounding, if it has no fewer views than ``config.match.views`` and
-    no fewer surface points than ``config.refine.points``; with fewer, it is tried and refined as often as the others.
+    they rank behind all others and no feature is taken from them. Surface and appearance points repeat the first one
+    with a normal of zero: they face no camera, so they are neither fitted nor drawn and widen no outline.
+    An object's estimate is the same as without padding, up to rounding, if it has at least ``config.match.views`` views
+    and ``config.refine.points`` surface points; with fewer, it gets as many hypotheses and points as the others.
 
     Args:
         objects: each as ``load`` or ``onboard`` return it, or after ``compact``; not batched.

@@ -1,4 +1,4 @@
-"""Cards beside the photo: what of the query was matched with what of a template, and the numbers of the estimate."""
+"""Cards next to the photo: the pairs between the query and a template, and the numbers of the estimate."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ _PAPER, _CARD, _FAINT = (18, 20, 26), (30, 33, 42), (150, 156, 170)
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """What an estimate rests on, for the panel beside the photo.
+    """The crop, the template and the pairs that led to an estimate, for its card.
 
     Args:
         crop: the query's crop, RGB in [0, 1] or uint8.
@@ -119,8 +119,8 @@ def _draw_pairs(evidence: Evidence, side: int, gap: int, most: int = 60) -> np.n
     longest = max(height, width)
     a = resize_pixels(evidence.crop_points, (longest, longest), (side, side))
     b = resize_pixels(evidence.template_points, (1, 1), (side, side)) + np.array([side + gap, 0])
-    # All outliers behind, inliers in front; few enough that single lines can be followed. Colour by place, so that
-    # lines which run together can be told apart.
+    # Outliers first, inliers over them, and few enough that single lines can be followed. Colours follow the place, so
+    # that neighbouring lines differ.
     outliers, inliers = np.flatnonzero(~evidence.inlier), np.flatnonzero(evidence.inlier)
     for chosen, share in ((outliers, most // 4), (inliers, most)):
         if len(chosen) > share:
@@ -130,7 +130,7 @@ def _draw_pairs(evidence: Evidence, side: int, gap: int, most: int = 60) -> np.n
             hue = int(179 * np.clip(a[i, 1] / side, 0, 1) * 0.85)
             bright = cv2.cvtColor(np.array([[[hue, 190, 255]]], np.uint8), cv2.COLOR_HSV2RGB)[0, 0].tolist()
             stroke = bright if evidence.inlier[i] else (150, 60, 60)
-            p, q = in_sixteenths(a[i]), in_sixteenths(b[i])
+            p, q = to_fixed_point(a[i]), to_fixed_point(b[i])
             cv2.line(layer, p, q, stroke, 1, cv2.LINE_AA, 4)
             for point in (p, q):
                 cv2.circle(layer, point, 40, (10, 10, 10), -1, cv2.LINE_AA, 4)
@@ -139,8 +139,8 @@ def _draw_pairs(evidence: Evidence, side: int, gap: int, most: int = 60) -> np.n
     return picture
 
 
-def place_beside(photo: np.ndarray, cards: list[np.ndarray]) -> np.ndarray:
-    """The photo at the left, the cards in columns beside it."""
+def attach_cards(photo: np.ndarray, cards: list[np.ndarray]) -> np.ndarray:
+    """The photo at the left, the cards in columns to the right of it."""
     if not cards:
         return photo
     gap = 14
@@ -172,6 +172,6 @@ def find_font(size: int):
         return ImageFont.load_default()
 
 
-def in_sixteenths(point: np.ndarray) -> tuple[int, int]:
+def to_fixed_point(point: np.ndarray) -> tuple[int, int]:
     """OpenCV's fixed-point coordinates, 4 bits of fraction."""
     return round(float(point[0]) * 16), round(float(point[1]) * 16)

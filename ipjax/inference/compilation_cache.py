@@ -15,7 +15,7 @@ def use_compilation_cache() -> None:
     """
     if os.environ.get("IPJAX_NO_CACHE", "") not in ("", "0"):
         return
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:  # somebody has decided already
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is not None:  # the user has set one
         return
     folder = cache_folder("xla")
     try:

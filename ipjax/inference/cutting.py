@@ -34,7 +34,7 @@ def cut_square(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, edg
     cover = np.ascontiguousarray(_padded(mask.view(np.uint8), left, top, side))
     cut_rgb = _to_float(_resize(np.ascontiguousarray(_padded(rgb, left, top, side)), resolution))
     cut_mask = mask_from_coverage(_resize(cover.astype(np.float32), resolution))
-    # A large frame has neighbours that are not worth comparing one by one. What lies around the square counts, too.
+    # Cleaning compares neighbouring pixels, which is slow on a large frame: only the square and a margin are cleaned.
     step = max(side // (2 * resolution), 1)
     margin = 2 * step
     begin, length = (left - margin, top - margin), side + 2 * margin
@@ -50,9 +50,9 @@ def cut_square(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, edg
 
 
 def cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, edge_tolerance):
-    """What a camera would see that was turned until the mask's centre is on its axis; as `cut_square`.
+    """As `cut_square`, seen by the camera turned until the mask's centre is on its optical axis.
 
-    Depth is along the new axis; the last that is returned is the rotation ``camera_from_crop``.
+    Depth is along the new axis; the last value returned is the rotation ``camera_from_crop``.
     """
     left, top, right, bottom = bounds
     corners = np.array([[left, top], [right - 1, top], [left, bottom - 1], [right - 1, bottom - 1]], np.float64)

@@ -71,7 +71,7 @@ def sample_depth(
     weight = np.stack([q * p for q in (1 - down, down) for p in (1 - across, across)])
     weight[near <= 0] = 0
     known = weight.sum(0)
-    # Where several are equally near, the one that hides the others, so that no side is preferred.
+    # Of equally near pixels the foremost, which hides the others, so that no direction is preferred.
     foremost = np.where(weight >= weight.max(0) - 1e-4, near, np.inf).min(0)
     weight[np.abs(near - foremost) > edge_tolerance * foremost] = 0
     inverse = np.sum(weight / np.maximum(near, 1e-9), axis=0)

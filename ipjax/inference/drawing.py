@@ -1,4 +1,4 @@
-"""Pictures of an estimate: outline, axes and box over the photo, and beside it what was matched with what."""
+"""Pictures of an estimate: outline, axes and box over the photo, and next to it the pairs that were matched."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from ipjax.estimation.pipeline import comparable
 from ipjax.files.cameras.reading import as_intrinsics
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import writing
-from ipjax.inference.cards import INK, Evidence, draw_card, find_font, in_sixteenths, place_beside
+from ipjax.inference.cards import INK, Evidence, attach_cards, draw_card, find_font, to_fixed_point
 from ipjax.records import PoseEstimate, Query, Similarity, Templates
 
 PALETTE = ((64, 224, 208), (255, 183, 77), (186, 104, 200), (129, 199, 132), (100, 181, 246), (240, 98, 146))
@@ -32,7 +32,7 @@ def gather_evidence(
     info: ObjectInfo,
     config: Config = Config(),
 ) -> Evidence:
-    """Match the query once more with the chosen template alone, and see which pairs the pose explains."""
+    """Match the query once more, with the chosen template alone, and mark the pairs that agree with the pose."""
     view = int(estimate.view)
     one = dataclasses.replace(
         templates,
@@ -108,7 +108,7 @@ def draw(
         draw_card(estimate, info, one, PALETTE[i % len(PALETTE)], compact=len(objects) > 1)
         for i, (estimate, info, one) in enumerate(zip(estimates, objects, evidence, strict=True))
     ]
-    return place_beside(photo, cards)
+    return attach_cards(photo, cards)
 
 
 def draw_overlay(
@@ -182,7 +182,7 @@ def write_image(path: str | Path, image: np.ndarray) -> None:
 def _line(image: np.ndarray, a: np.ndarray, b: np.ndarray, colour, width: int, reach: float = 1e5) -> None:
     if np.abs([a, b]).max() > reach:
         return
-    start, end = in_sixteenths(a), in_sixteenths(b)
+    start, end = to_fixed_point(a), to_fixed_point(b)
     cv2.line(image, start, end, (10, 10, 10), width + 2, cv2.LINE_AA, 4)
     cv2.line(image, start, end, colour, width, cv2.LINE_AA, 4)
 

@@ -17,7 +17,7 @@ from ipjax.inference.batching import compact
 from ipjax.inference.frames import frame_turned
 from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
 
-# Patches of compacted templates: every other count compiles anew, and objects differ; this makes two sizes of most.
+# Compacted templates have a multiple of so many patches: each count is compiled anew, and most objects now share two.
 MULTIPLE = 64
 
 
@@ -31,20 +31,20 @@ class Result:
     templates: Templates
     info: ObjectInfo
     seconds: dict[str, float]  # frame, describe, estimate; compile where it happened
-    warnings: tuple[str, ...] = ()  # what speaks against the answer, a sentence each
+    warnings: tuple[str, ...] = ()  # reasons to doubt the estimate, a sentence each
 
 
 class Estimator:
     """Objects and an encoder, ready for frames; compiles once for each shape of templates.
 
-    Templates lose their background when they are first used (`object_file.compact`): the answers are the same, in about
-    half the time for matching.
+    Templates are compacted when they are first used (`ipjax.compact`): the estimates are the same, in about half the
+    time for matching.
 
     Args:
-        objects: templates and what is known of them, as `object_file.load` returns them.
+        objects: templates and what is known of them, as `ipjax.load` returns them.
         encoder: made the templates' features.
         config: of the estimate.
-        options: of `frames.frame_turned`; "square" crops by default.
+        options: of `ipjax.inference.frames.frame_turned`; "square" crops by default.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class Estimator:
         self._compacted: dict[int, Templates] = {}
 
     def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
-        """The crop of one object, before anything is described: bad input is refused here.
+        """The crop of one object; bad input is refused here, before anything is described.
 
         Raises:
-            ValueError: as `frames.frame`.
+            ValueError: as `ipjax.frame`.
         """
         options: dict[str, Any] = {"resolution": self.objects[index][1].resolution} | self.options
         return frame_turned(rgb, depth, mask, camera, box=box, **options)

@@ -8,7 +8,7 @@ from ipjax.inference.depth import to_metres
 
 
 def drop_specks(mask: np.ndarray) -> tuple[np.ndarray, tuple[int, int, int, int]]:
-    """The mask without components below 2 % of the largest, which would blow up the crop; and its bounds."""
+    """The mask without components below 2 % of the largest, which would enlarge the crop; and its bounds."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.view(np.uint8), connectivity=8)
     areas = stats[1:, cv2.CC_STAT_AREA]
     keep = np.zeros(count, bool)

@@ -46,7 +46,7 @@ def pose_as_json(camera_from_b: Similarity[np.ndarray], unit: str) -> dict[str, 
 
 
 def relative_pose(camera_from_object: Similarity, info: ObjectInfo) -> Similarity[np.ndarray]:
-    """``camera_from_reference_camera`` of an estimate: metres here, and per unit there; in doubles.
+    """``camera_from_reference_camera`` of an estimate, in doubles: metres per unit of the reference camera.
 
     Raises ValueError for an object that was not made from a photo.
     """
@@ -73,9 +73,9 @@ def relative_pose_as_json(camera_from_object: Similarity, info: ObjectInfo) -> d
         camera_from_mesh = Similarity(
             *(np.asarray(x, np.float64) for x in (reference.rotation, reference.translation, reference.scale))
         )
-        there = camera_from_mesh @ np.asarray(info.mesh_centre, np.float64)[None]
+        centre = camera_from_mesh @ np.asarray(info.mesh_centre, np.float64)[None]
         turn = Similarity(pose.rotation, np.zeros(3), np.ones(()))
-        motion = Similarity(pose.rotation, (pose @ there - turn @ there)[0], np.ones(()))
+        motion = Similarity(pose.rotation, (pose @ centre - turn @ centre)[0], np.ones(()))
         entry["rigid_motion"] = motion.to_matrix().tolist()
     return entry
 

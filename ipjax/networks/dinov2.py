@@ -22,7 +22,7 @@ from ipjax.records import UNNAMED
 
 _MEAN = (0.485, 0.456, 0.406)  # ImageNet, RGB
 _DEVIATION = (0.229, 0.224, 0.225)
-_HIGHEST = jax.lax.Precision.HIGHEST  # float32 means float32 on every device; whoever wants speed takes bfloat16
+_HIGHEST = jax.lax.Precision.HIGHEST  # true float32 on every device; for speed there is bfloat16
 
 
 @dataclasses.dataclass(frozen=True)
@@ -274,7 +274,7 @@ def embed(model: DinoV2, images: Float[Array, "b h w 3"]) -> Float[Array, "b n c
     embedding = model.pos_embed[...]
     where = position_embedding(embedding[0, 1:], (rows, columns), antialias=config.antialias, offset=config.offset)
     parts = [(model.cls_token[...] + embedding[:, :1]), (patches + where).reshape(b, rows * columns, c)]
-    if config.registers:  # after the position embedding: registers have no place
+    if config.registers:  # after the position embedding, which registers do not get
         parts.insert(1, model.register_tokens[...])
     return jnp.concatenate([jnp.broadcast_to(part, (b, *part.shape[1:])) for part in parts], axis=1)
 

@@ -1,1 +1,1 @@
-"""From a mesh or a photo to an object that can be found."""
+"""From a mesh or a photo to templates of an object, and a report on them."""

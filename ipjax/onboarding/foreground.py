@@ -313,7 +313,7 @@ def _fill_holes(mask: np.ndarray) -> np.ndarray:
 
 
 def _plain_background(rgb: np.ndarray) -> tuple[np.ndarray, float]:
-    """What differs from the border's colour, and how much the border itself varies (90 % within; CIELAB units).
+    """Pixels that differ from the border's colour, and the 90 % quantile of the border's own deviations (CIELAB units).
 
     The border's colour may change slowly across the photo (a quadratic in x and y); shadows count half.
     """
@@ -361,7 +361,7 @@ def draw_attempts(photo: Photo, attempts: list[tuple[str, np.ndarray]], path: st
         Image.fromarray(np.concatenate(sheet, axis=1)).save(temporary)
 
 
-# --- as the model was trained -----------------------------------------------------------------------------------------
+# --- the input of the reconstruction model ----------------------------------------------------------------------------
 
 
 def crop_foreground(
@@ -369,7 +369,7 @@ def crop_foreground(
 ) -> tuple[UInt8[np.ndarray, "n n 4"], tuple[int, int]]:
     """A transparent square around the object, which fills ``ratio`` of it; and its corner in the photo (x, y).
 
-    To the letter what the published model was trained with (tsr/utils.py, resize_foreground): foreground is alpha > 0,
+    Exactly what the published model was trained with (tsr/utils.py, resize_foreground): foreground is alpha > 0,
     the last row and column of it are dropped, paddings are rounded down, nothing is resampled.
     """
     rows, columns = np.nonzero(rgba[..., 3] > 0)

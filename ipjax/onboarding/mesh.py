@@ -1,4 +1,4 @@
-"""From a mesh to templates: render the object from everywhere, describe every view, lift every patch."""
+"""From a mesh to templates: render the object from all directions, describe every view, lift every patch."""
 
 import dataclasses
 import os
@@ -87,7 +87,7 @@ def box_axes(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3 3"]:
 
 
 def make_appearance(mesh: Mesh, count: int) -> Appearance:
-    """``count`` coloured points of a normalised mesh, as drawing candidates takes them; always the same ones."""
+    """``count`` coloured points of a normalised mesh, from which candidates are drawn; always the same ones."""
     points, normals, colours = sample_appearance(mesh, count)
     return Appearance(
         jnp.asarray(points, jnp.float32),
@@ -175,7 +175,7 @@ def make_templates(
 def _describe(
     encoder: Encoder, view: View, camera_from_object: Similarity, surface: Surface, config: DescribeConfig
 ) -> tuple[Patches, Float[Array, "p"]]:
-    """The patches of one template in the object's frame, and how far the surface under each was seen."""
+    """The patches of one template in the object's frame, and the share of the surface under each that was seen."""
     patches = describe(encoder, view, config)
     # x_object = Rᵀ (x_camera − t): the rotation is orthonormal and a template's scale is 1.
     offset = patches.points - camera_from_object.translation
@@ -200,7 +200,7 @@ def onboard(
     progress: bool = True,
     backend: str = "auto",
 ) -> tuple[Templates, ObjectInfo]:
-    """Make an object ready to be found.
+    """Onboard an object: make the templates that `ipjax.estimate` matches, from a mesh.
 
     Args:
       source: a mesh file (OBJ, PLY, GLB, glTF, STL) or a ``Mesh``.

@@ -1,4 +1,4 @@
-"""From one photo to an object that can be found: mask, mesh, templates, and where the photo's camera stood."""
+"""From one photo to an onboarded object: mask, mesh, templates, and the pose of the photo's camera."""
 
 import dataclasses
 import logging
@@ -73,7 +73,7 @@ def onboard_photo(
     progress: bool = True,
     backend: str = "auto",
 ) -> PhotoObject:
-    """Make an object ready to be found from one photo of it.
+    """Onboard an object from one photo of it: reconstruct a mesh, then make its templates.
 
     Args:
       source: a photo's file, or a `Photo`.
@@ -82,7 +82,7 @@ def onboard_photo(
       box: (x, y, width, height) around the object, pixels of the photo's file.
       click: (x, y) on the object, likewise.
       depth: file, or height × width along z, aligned to the photo; needs ``camera``. The object is then in metres.
-      camera: anything `images.read_camera` or `as_intrinsics` takes.
+      camera: anything that `read_camera` or `as_intrinsics` of `ipjax.files.cameras.reading` takes.
       depth_scale: metres per unit of depth; default: the camera file's, else 1 for floats.
       lrm: "triposr" (needs its weights), "inflate" (needs none), or "auto": what was measured where there is depth,
         else TripoSR where its weights are, else inflation. Nothing is downloaded.

@@ -1,4 +1,4 @@
-"""Where templates are seen from: evenly spread directions, each with a full turn of in-plane rolls."""
+"""The viewpoints of templates: evenly spread directions, each with a full turn of in-plane rolls."""
 
 import jax.numpy as jnp
 import numpy as np

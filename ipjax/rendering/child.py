@@ -58,7 +58,7 @@ def build_model(folder: Path, job: dict) -> mujoco.MjModel:
             type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"mesh{i}", material=f"material{i}", contype=0, conaffinity=0
         )
     model = spec.compile()
-    # It also moves every mesh into a frame of its own; our vertices, written now, are in ours.
+    # The compiler also moves every mesh into a frame of its own: vertices and normals are written again in ours.
     for i, mesh in enumerate(arrays):
         start, count = model.mesh_vertadr[i], model.mesh_vertnum[i]
         if count != len(mesh["vertices"]):
@@ -71,7 +71,7 @@ def build_model(folder: Path, job: dict) -> mujoco.MjModel:
     return model
 
 
-def stop_mipmaps(context: mujoco.MjrContext, textures: list[int]) -> None:
+def disable_mipmaps(context: mujoco.MjrContext, textures: list[int]) -> None:
     """Colour atlases must not be minified: coarser levels mix faces that are not neighbours on the surface."""
     from OpenGL import GL
 
@@ -129,7 +129,7 @@ def shrink(rgb: np.ndarray, covered: np.ndarray, factor: int) -> np.ndarray:
 
 
 def main(folder: Path) -> None:
-    """Draw all frames of the job in the folder, and tell the parent on standard output how far it is."""
+    """Draw all frames of the job in the folder, and report progress to the parent on standard output."""
     job = json.loads((folder / "job.json").read_text())
     poses = np.load(folder / "poses.npy")  # frame, mesh, 3, 4
     frusta = np.load(folder / "frusta.npy")  # frame, 6
@@ -151,7 +151,7 @@ def main(folder: Path) -> None:
         raise RuntimeError("no offscreen framebuffer")
     print("ready", flush=True)
     context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
-    stop_mipmaps(context, job["atlases"])
+    disable_mipmaps(context, job["atlases"])
 
     scene = mujoco.MjvScene(model, maxgeom=job["meshes"] + 8)
     everything = mujoco.mjtCatBit.mjCAT_ALL.value
@@ -161,7 +161,7 @@ def main(folder: Path) -> None:
     # A frame lists only what it shows: meshes shrunk to a point would cost as much as the others.
     geoms = [scene.geoms[i] for i in range(scene.ngeom)]
     names = [name for name in ("dataid", "matid", "texid", "texcoord") if hasattr(geoms[0], name)]
-    looks = {geom.objid: [(name, getattr(geom, name)) for name in names] for geom in geoms}
+    appearances = {geom.objid: [(name, getattr(geom, name)) for name in names] for geom in geoms}
 
     def output(name: str, dtype: str, *tail: int) -> np.memmap:
         return np.lib.format.open_memmap(
@@ -179,7 +179,7 @@ def main(folder: Path) -> None:
         shown = np.flatnonzero(poses[frame, :, :, :3].any((1, 2))).tolist()
         for slot, i in enumerate(shown):
             geom = scene.geoms[slot]
-            for name, value in looks[i]:
+            for name, value in appearances[i]:
                 setattr(geom, name, value)
             geom.mat[:] = poses[frame, i, :, :3]
             geom.pos[:] = poses[frame, i, :, 3]

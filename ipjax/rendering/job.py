@@ -1,4 +1,4 @@
-"""What is to be rendered, checked, and the images that come of it."""
+"""A rendering job, checked, and the images that it results in."""
 
 import dataclasses
 
@@ -55,7 +55,7 @@ class Job:
     width: int
     oversample: int  # samples on a side of a pixel; odd
     light: dict | None  # direction [3] in the camera frame, ambient, diffuse; None = unlit
-    segment: bool  # whether it must be known which mesh is at each pixel
+    segment: bool  # also render which mesh is at each pixel
 
     def __post_init__(self):
         if self.height < 1 or self.width < 1:

@@ -1,4 +1,4 @@
-"""MuJoCo draws a job in a child process: the job's files, the child's lines, and what its failures mean.
+"""MuJoCo draws a job in a child process: writing the job, reading the child's output, and explaining its failures.
 
 MuJoCo reads MUJOCO_GL when it is imported, and a GL library that does not work can end the process that tries it. So
 every job is drawn by a child (`child.py`), which runs with the backend that its parent chose.
@@ -33,9 +33,9 @@ _REMEDIES = {
     "native": "a desktop session is needed for the native GL of this system",
 }
 _CHILD = Path(__file__).with_name("child.py")
-_TIMEOUT = 180.0  # seconds without a line from a child that does not use the processor either
-_LONGEST_SILENCE = 3600.0  # seconds without a line, whatever the child does
-_FAILURES_ALLOWED = 2  # failures in a row before a context was there, after which a backend is not tried for a while
+_TIMEOUT = 180.0  # seconds without output, after which a child that uses no processor time is ended
+_LONGEST_SILENCE = 3600.0  # seconds without output, after which any child is ended
+_FAILURES_ALLOWED = 2  # failures in a row to create a context, after which a backend is not tried for a while
 _RETRY_AFTER = 600.0  # seconds after which it is tried again
 _failures: dict[str, list[tuple[float, str]]] = {}  # such failures in a row, by backend: when, and why
 
@@ -54,13 +54,13 @@ def gl_backends() -> list[str]:
     """GL backends worth trying here, best first."""
     if platform.system() != "Linux":
         return ["native"]
-    wish = os.environ.get("MUJOCO_GL", "").lower().strip()
+    preferred = os.environ.get("MUJOCO_GL", "").lower().strip()
     names = ["egl", "osmesa"]
-    return sorted(names, key=lambda name: name != wish)
+    return sorted(names, key=lambda name: name != preferred)
 
 
 def recent_failure(backend: str) -> str | None:
-    """Why a backend is not worth a try for now: it failed repeatedly, and not long ago; None where it is."""
+    """Why a backend is not tried for now: it failed repeatedly, and not long ago; None where it may be tried."""
     failures = _failures.get(backend, [])
     if len(failures) >= _FAILURES_ALLOWED and time.monotonic() - failures[-1][0] < _RETRY_AFTER:
         return failures[-1][1]
@@ -68,7 +68,7 @@ def recent_failure(backend: str) -> str | None:
 
 
 def draw_mujoco(job: Job, backend: str, progress: Callable[[int, int], None] | None) -> Renders:
-    """Draw with MuJoCo, and once more where that fails: a single failure may come from the state of the machine.
+    """Draw with MuJoCo, with a second try if the first fails, for instance on a busy machine.
 
     Only failures in a row before anything could be drawn are remembered, and those only for a while. RenderError in
     one sentence if it fails.
@@ -81,7 +81,7 @@ def draw_mujoco(job: Job, backend: str, progress: Callable[[int, int], None] | N
         except NoContextError as error:
             failures = _failures.setdefault(backend, [])
             failures.append((time.monotonic(), str(error)))
-            # A second silence would take as long again; and a backend that was left alone gets one try, not two.
+            # No second try after a timeout, which would take as long again, nor for a backend that failed not long ago.
             if last or error.silent or len(failures) > _FAILURES_ALLOWED:
                 raise
         except RenderError as error:
@@ -153,8 +153,8 @@ def _write_job(job: Job, folder: Path) -> None:
             uv, uv_faces, texture = _face_atlas(mesh)
             atlases.append(i)
         normals = np.where(np.abs(mesh.normals).sum(-1, keepdims=True) > 0, mesh.normals, [0.0, 0.0, 1.0])
-        spare = np.zeros(max(4 - len(normals), 0), np.int64)  # MuJoCo takes four vertices or more
-        vertices, normals = (np.concatenate([x, x[spare]]) for x in (mesh.vertices, normals))
+        filler = np.zeros(max(4 - len(normals), 0), np.int64)  # MuJoCo takes four vertices or more
+        vertices, normals = (np.concatenate([x, x[filler]]) for x in (mesh.vertices, normals))
         np.savez(
             folder / f"mesh{i}.npz",
             vertices=vertices.astype(np.float32),
@@ -219,7 +219,7 @@ class _Ending:
 
 
 def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int], None] | None) -> _Ending:
-    """Follow the child's lines to its end, or until it is neither heard nor working."""
+    """Read the child's output to its end, or until the child neither prints nor uses the processor."""
     lines: queue.Queue[str | None] = queue.Queue()
 
     def read() -> None:
@@ -231,19 +231,19 @@ def _listen(process: subprocess.Popen, total: int, progress: Callable[[int, int]
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
     ready = False
-    heard, worked = time.monotonic(), _processor_seconds(process.pid)
+    last_line, processor_used = time.monotonic(), _processor_seconds(process.pid)
     try:
         while True:
             try:
                 line = lines.get(timeout=_TIMEOUT)
             except queue.Empty:
-                silence, now = time.monotonic() - heard, _processor_seconds(process.pid)
+                silence, now = time.monotonic() - last_line, _processor_seconds(process.pid)
                 # Compiling a large mesh and drawing without a GPU take long, with nothing printed meanwhile.
-                if now - worked > 0.01 * _TIMEOUT and silence < _LONGEST_SILENCE:
-                    worked = now
+                if now - processor_used > 0.01 * _TIMEOUT and silence < _LONGEST_SILENCE:
+                    processor_used = now
                     continue
                 return _Ending("silent", f"no answer for {silence:.0f} s", ready)
-            heard, worked = time.monotonic(), _processor_seconds(process.pid)
+            last_line, processor_used = time.monotonic(), _processor_seconds(process.pid)
             if line is None:
                 return _Ending("died", "", ready)
             word, _, rest = line.strip().partition(" ")

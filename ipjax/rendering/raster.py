@@ -1,4 +1,4 @@
-"""Our own z-buffer draws a job: slower than a GL library, and the same everywhere."""
+"""Our own z-buffer as a renderer: slower than a GL library, and the same on every machine."""
 
 from collections.abc import Callable
 

@@ -119,7 +119,7 @@ def render_each(
 
 
 def available_backends() -> dict[str, str]:
-    """What each backend of this system says when asked to draw a triangle: "ok" or the reason it cannot."""
+    """Whether each backend of this system can draw a triangle: "ok", or the reason why not."""
     import jax.numpy as jnp
 
     from ipjax.files.meshes.mesh import make_mesh

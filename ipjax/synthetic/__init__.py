@@ -1,1 +1,1 @@
-"""Made objects, scenes, damage and problems with known answers: what the demo, the tests and benchmarks are fed."""
+"""Synthetic objects, scenes, degraded meshes and problems with known answers, for the demo, tests and benchmarks."""

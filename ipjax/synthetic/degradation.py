@@ -33,7 +33,7 @@ SMOOTHING = 0.5  # how far a vertex goes towards the mean of its neighbours
 
 
 def alignment_as_json(original_from_degraded: Similarity[np.ndarray]) -> dict:
-    """The form in which alignment files are kept."""
+    """The similarity as alignment files hold it."""
     return {
         "comment": "x_original = scale * R @ x_degraded + t; for evaluation only",
         "scale": float(original_from_degraded.scale),
@@ -43,7 +43,7 @@ def alignment_as_json(original_from_degraded: Similarity[np.ndarray]) -> dict:
 
 
 def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Similarity[np.ndarray]]:
-    """A worse mesh, and ``original_from_degraded``, the map back to the given mesh's frame, for evaluations only.
+    """A degraded mesh, and ``original_from_degraded``, the similarity to the given mesh's frame, for evaluations only.
 
     The result is a mesh of its own: unknown scale (0.1 to 10 diameters) and rotation. Its `seen` is 0 on the half that
     was made up. Where the mesh has no texture, its vertex colours are blurred along its edges to the same width.
@@ -74,7 +74,7 @@ def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Similarity[np.
         worse = _bump(worse, BUMPS[level], random)
         worse = dataclasses.replace(worse, vertices=worse.vertices * np.array(STRETCH))
         if level == 4:
-            worse = _tear(worse, random)
+            worse = _remove_patches(worse, random)
     # Uniform rotation from a normal quaternion; the scale is uniform in its logarithm.
     w, x, y, z = _unit_vector(random.standard_normal(4))
     rotation = np.array(
@@ -240,7 +240,7 @@ def _cluster(mesh: Mesh, random: np.random.Generator) -> Mesh:
     )
 
 
-def _tear(mesh: Mesh, random: np.random.Generator) -> Mesh:
+def _remove_patches(mesh: Mesh, random: np.random.Generator) -> Mesh:
     """Remove a tenth of the faces: those nearest to a few random places of the surface."""
     middle = mesh.vertices[mesh.faces].mean(1)
     places = middle[random.integers(0, len(middle), PATCHES)]

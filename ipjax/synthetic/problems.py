@@ -1,4 +1,4 @@
-"""Whole problems with known answers, made of formulas: an ellipsoid whose colour is its own coordinate.
+"""Problems with known answers, computed by formulas: an ellipsoid whose colour is its own coordinate.
 
 Tests and benchmarks share them. The stand-in encoder turns that coordinate into smooth random features, so
 matching is as hard as the noise asked for, no weights are needed, and every image is exact.

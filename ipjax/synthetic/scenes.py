@@ -1,4 +1,4 @@
-"""Scenes made in code, with their true poses: what the demo shows and what confidence is fitted on.
+"""Synthetic scenes with their true poses, for the demo and for fitting the confidence.
 
 Everything follows from a kind and a seed, so two people with the same version see the same scene. Objects have unit
 diameter, like every normalised mesh; a scene gives each a size in metres.
@@ -110,7 +110,7 @@ def make_scene(
 
 @functools.lru_cache(maxsize=10 * len(KINDS))
 def _make_clutter(number: int) -> Mesh:
-    """One of a fixed crowd, so that many scenes do not make a new crowd each; seeds that no caller's object has."""
+    """One of a fixed set of objects, made once for many scenes; from seeds that no caller's object has."""
     return make_object(KINDS[number % len(KINDS)], 10**9 + number)
 
 

@@ -1,4 +1,4 @@
-"""The shapes of made objects, as charts: each is a rectangle of surface laid flat on its part of a texture.
+"""The shapes of synthetic objects, as charts: pieces of surface, each with its own rectangle of the texture.
 
 Every maker draws its proportions from a generator. Units are free: what is made of a shape is normalised.
 """

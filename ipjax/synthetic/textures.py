@@ -1,4 +1,4 @@
-"""Printed surfaces, drawn from a seed: what the made objects, tables and walls are covered with."""
+"""Random printed textures, from a seed, for synthetic objects, tables and walls."""
 
 import numpy as np
 from jaxtyping import UInt8

@@ -33,7 +33,7 @@ COEFFICIENTS = re.compile(
 )
 MODEL = re.compile(r"^(dist(ortion)?(model|type|name)|projection(model|type|modeltype)?)$")
 MODEL_OR_DEVICE = re.compile(r"^(lens|lens(model|type)|model|type|modeltype|modelname)$")  # or the name of a device
-# Dictionaries that stand for their members.
+# Nested dictionaries whose members are read as if they stood in the camera itself.
 GROUPS = {
     "info",
     "image",
@@ -47,7 +47,7 @@ GROUPS = {
 
 
 class Fields:
-    """The entries of a camera by their names without case, punctuation and prefix; what was taken is known."""
+    """The entries of a camera by their names without case, punctuation and prefix; knows which were read."""
 
     def __init__(self, entry: dict):
         self.items: list[tuple[str, str, Any]] = []  # name, as spelled, value
@@ -59,7 +59,7 @@ class Fields:
             name = re.sub(r"[^a-z0-9]", "", str(key).lower())
             name = PREFIX.sub("", name)
             parts = isinstance(value, dict) and "data" not in value
-            # Dictionaries of coefficients, of focal lengths or about the model stand for their members.
+            # Members of a dictionary of coefficients, focal lengths or the model are entries of the camera.
             if parts and (COEFFICIENTS.match(name) or MATRIX.match(name) or name in GROUPS or _names_a_model(name)):
                 self._add(value)
             else:

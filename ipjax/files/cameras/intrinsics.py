@@ -81,12 +81,12 @@ def check_depth_scale(scale: Any, what: str = "depth_scale") -> float:
         return value
     units = {"m": 1, "metre": 1, "meter": 1, "mm": 0.001, "millimetre": 0.001, "millimeter": 0.001, "cm": 0.01}
     number = units.get(scale.strip().lower().rstrip("s")) if isinstance(scale, str) else None
-    meant = "0.001 for millimetres, 1 for metres" if number is None else f"{number:g} for {scale}"
-    raise ValueError(f"{what} must be a positive number of metres per depth unit ({meant}), not {scale!r}")
+    hint = "0.001 for millimetres, 1 for metres" if number is None else f"{number:g} for {scale}"
+    raise ValueError(f"{what} must be a positive number of metres per depth unit ({hint}), not {scale!r}")
 
 
 def list_misfits(intrinsics: Intrinsics, width: int, height: int) -> list[str]:
-    """What speaks against a camera belonging to images of a size, a sentence each; empty where nothing does.
+    """Reasons to doubt that a camera belongs to images of this size, a sentence each; empty where there are none.
 
     A principal point more than a tenth of the image away from its middle, a field of view below 10° or above 120°,
     and pixels far from square are rare in cameras and usual in a matrix of another image.

@@ -1,6 +1,6 @@
 """Lens models: those that OpenCV can undistort, their names elsewhere, and how files spell their coefficients.
 
-What is about a lens and is not understood is refused: a lens that is not applied moves the object without a word.
+An entry that seems to describe a lens and is not understood is refused: ignoring a lens would move every pose silently.
 """
 
 import re
@@ -147,8 +147,8 @@ def read_lens(fields: Fields) -> tuple[str, tuple[float, ...]]:
     if any(scalars.values()):
         if array.any():
             raise ValueError("the distortion is given twice, as a list and as k1, k2 …; keep one")
-        fishy = next(iter(more), "") == "equidistant"
-        if fishy:
+        is_fisheye = next(iter(more), "") == "equidistant"
+        if is_fisheye:
             if any(value for name, value in scalars.items() if name not in ("k1", "k2", "k3", "k4")):
                 raise ValueError(f"the lens model {lens!r} has the coefficients k1 to k4 only")
             array = np.array([scalars[f"k{i}"] for i in range(1, 5)])

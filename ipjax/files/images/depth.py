@@ -1,4 +1,4 @@
-"""Depth images: in the number type of their file; `frames.frame` settles the unit by ``depth_scale``."""
+"""Depth images, in the number type of their file; `ipjax.frame` converts the unit by ``depth_scale``."""
 
 import struct
 from pathlib import Path
@@ -68,10 +68,10 @@ def remove_sentinel(depth: np.ndarray) -> tuple[np.ndarray, str]:
         extreme = others(values)
         same = values == extreme
         rest = values[~same]
-        strange = others is np.max and float(extreme) in _LARGEST_NUMBERS
-        if not strange and rest.size and same.sum() >= 0.05 * depth.size:
-            strange = extreme >= 1.5 * others(rest) if others is np.max else extreme <= 0.2 * others(rest)
-        if strange:
+        is_sentinel = others is np.max and float(extreme) in _LARGEST_NUMBERS
+        if not is_sentinel and rest.size and same.sum() >= 0.05 * depth.size:
+            is_sentinel = extreme >= 1.5 * others(rest) if others is np.max else extreme <= 0.2 * others(rest)
+        if is_sentinel:
             found.append(extreme)
             values = rest
         if values.size == 0:

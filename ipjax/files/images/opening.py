@@ -70,7 +70,7 @@ def open_image(path: str | Path, *, load: bool = True, max_side: int | None = No
             needed += BYTES_PER_PIXEL * image.size[0] * image.size[1]
             check_budget(needed, f"an image of {width} × {height} pixels")
             turn = get_orientation(image)
-            image.load()  # which turns a TIFF and forgets that it did
+            image.load()  # Pillow turns a TIFF by its orientation here, and drops the orientation
             image.info[_ORIENTATION_KEPT] = turn
     except UnidentifiedImageError:
         raise ValueError(f"{path}: not an image") from None

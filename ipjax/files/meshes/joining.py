@@ -12,7 +12,7 @@ from ipjax.files.meshes.textures import Texture, TextureError, from_linear
 
 @dataclasses.dataclass
 class Joined:
-    """Arrays for `mesh.make_mesh`, and how the colours came about, in words."""
+    """Arrays for `ipjax.files.meshes.mesh.make_mesh`, and where the colours come from, in words."""
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -27,7 +27,7 @@ def join(parts: list[Part], source: Source) -> Joined:
 
     An image that cannot be decoded is left out with a warning. Raises ValueError where the mesh is too large.
     """
-    parts = [_settle_shade(part) for part in parts]
+    parts = [_tint_if_uniform(part) for part in parts]
     images: dict[Texture, np.ndarray | None] = {}
     while True:
         try:
@@ -65,8 +65,8 @@ def _colours_without_texture(part: Part) -> np.ndarray | None:
     return part.colours if part.shade is None else from_linear(part.shade)
 
 
-def _settle_shade(part: Part) -> Part:
-    """A shade that is the same everywhere is a tint of the image."""
+def _tint_if_uniform(part: Part) -> Part:
+    """The part with its shade as a tint of its texture, where the shade is the same everywhere."""
     if part.shade is None or part.texture is None or np.ptp(part.shade, axis=0).max() > 2e-3:
         return part
     tint = np.asarray(part.texture.tint) * part.shade.mean(0)

@@ -135,11 +135,11 @@ def _chart_colours(part: Part) -> list[tuple[Part, Chart, np.ndarray]]:
         one = split_corners(dataclasses.replace(part, faces=part.faces[~flat], colours=colours))
         corners = corners[~flat]
 
-        def shine(faces: slice, weights: np.ndarray) -> np.ndarray:
+        def colour_faces(faces: slice, weights: np.ndarray) -> np.ndarray:
             mixed = np.einsum("kc,fci->fki", weights, corners[faces].astype(np.float64))
             return np.round(np.clip(mixed, 0, 255)).astype(np.uint8)
 
-        pixels, place = bake(len(corners), 4 if len(corners) < 300_000 else 2, shine)
+        pixels, place = bake(len(corners), 4 if len(corners) < 300_000 else 2, colour_faces)
         result.append((one, Chart(pixels.shape[1], pixels.shape[0], pixels=pixels), place))
     return result
 
@@ -155,12 +155,12 @@ def _chart_shaded(part: Part, side: int, images: dict[Texture, np.ndarray | None
     light = to_linear(np.arange(256) / 255)
     uv, shade = part.uv[part.faces], part.shade[part.faces]
 
-    def shine(faces: slice, weights: np.ndarray) -> np.ndarray:
+    def colour_faces(faces: slice, weights: np.ndarray) -> np.ndarray:
         place = wrap_coordinates(np.einsum("kc,fci->fki", weights, uv[faces]), texture.wrap)
         colour = sample_texture(image, place.reshape(-1, 2)).reshape(*place.shape[:2], 3)
         return from_linear(light[colour] * np.maximum(np.einsum("kc,fci->fki", weights, shade[faces]), 0))
 
-    pixels, place = bake(len(part.faces), side, shine)
+    pixels, place = bake(len(part.faces), side, colour_faces)
     return split_corners(part), Chart(pixels.shape[1], pixels.shape[0], pixels=pixels), place
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 
 def simplify(vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None, most: int = 60_000):
-    """A mesh good enough for outlines: vertices in one cell of a grid become one, until few enough faces remain."""
+    """A coarser mesh, for outlines: vertices in one cell of a grid are merged, until few enough faces remain."""
     vertices, faces = np.asarray(vertices, np.float32), np.asarray(faces, np.int64)
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError("faces of the mesh refer to vertices that do not exist")

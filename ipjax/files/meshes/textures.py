@@ -163,7 +163,7 @@ def _from_wide(values: np.ndarray):
 
 @dataclasses.dataclass
 class Chart:
-    """An image in a packed texture: one repeated, or one made of colours; its corner is known once it is laid."""
+    """An image in a packed texture: one of the file, repeated, or one made of colours; `lay_out` sets its corner."""
 
     width: int  # of one repeat
     height: int
@@ -179,18 +179,18 @@ class Chart:
 
 
 def lay_out(charts: list[Chart]) -> tuple[int, int]:
-    """Put all charts on shelves, tallest first; each learns its corner. Returns the whole's width and height."""
+    """Place all charts in rows, tallest first, and set the corner of each. Returns the whole's width and height."""
     order = sorted(range(len(charts)), key=lambda i: (-charts[i].span[1], i))
     sides = [(chart.span[0] + 2 * GUTTER, chart.span[1] + 2 * GUTTER) for chart in charts]
     limit = max(math.ceil(math.sqrt(sum(width * height for width, height in sides))), *(width for width, _ in sides))
-    x = y = shelf = 0
+    x = y = row_height = 0
     for i in order:
         width, height = sides[i]
         if x + width > limit and x > 0:
-            x, y, shelf = 0, y + shelf, 0
+            x, y, row_height = 0, y + row_height, 0
         charts[i].left, charts[i].top = x + GUTTER, y + GUTTER
-        x, shelf = x + width, max(shelf, height)
-    return limit, y + shelf
+        x, row_height = x + width, max(row_height, height)
+    return limit, y + row_height
 
 
 def paint(charts: list[Chart], width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -208,11 +208,11 @@ def paint(charts: list[Chart], width: int, height: int) -> UInt8[np.ndarray, "h 
 
 
 def bake(
-    count: int, side: int, shine: Callable[[slice, np.ndarray], np.ndarray]
+    count: int, side: int, colour_faces: Callable[[slice, np.ndarray], np.ndarray]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Float[np.ndarray, "k 2"]]:
     """An image of blocks of ``side`` × ``side`` texels (at least 2), one per face, for colours that vary over faces.
 
-    ``shine(faces, weights)`` gives the colours of a slice of faces at the barycentric weights [side² 3], as
+    ``colour_faces(faces, weights)`` gives the colours of a slice of faces at the barycentric weights [side² 3], as
     [faces side² 3] uint8; beyond the long side of the triangle the weights go below 0. Returns the image, and where
     the three corners of every face are in it (x, y in texels from its upper left).
     """
@@ -227,7 +227,7 @@ def bake(
         stop = min(start + stride, rows)
         faces = slice(start * columns, min(stop * columns, count))
         blocks = np.zeros(((stop - start) * columns, side * side, 3), np.uint8)
-        blocks[: faces.stop - faces.start] = shine(faces, weights)
+        blocks[: faces.stop - faces.start] = colour_faces(faces, weights)
         canvas[start:stop] = blocks.reshape(stop - start, columns, side, side, 3).transpose(0, 2, 1, 3, 4)
     index = np.arange(count)
     first = np.stack([index % columns * side + 0.5, index // columns * side + 0.5], axis=-1)
@@ -236,7 +236,7 @@ def bake(
 
 
 def wrap_coordinates(uv: Float[np.ndarray, "*k 2"], wrap: tuple[str, str]) -> Float[np.ndarray, "*k 2"]:
-    """Coordinates in [0, 1] that mean the same as these where the image is mirrored or its border goes on."""
+    """Coordinates in [0, 1] that show the same texel as these under repeating, mirroring or clamping."""
     uv = np.array(uv)
     for axis, how in enumerate(wrap):
         if how == "clamp":

@@ -19,9 +19,9 @@ class Reference:
         rotation, translation, scale: ``camera_from_mesh``, x_camera = scale * rotation @ x_mesh + translation; metres
             where `metric`, else in the arbitrary unit of the reconstruction.
         focal, centre, size: of the photo's camera, given or assumed; pixels of the photo as it was read.
-        camera_given: the camera was entry, not assumed.
+        camera_given: the user gave the camera; else it was assumed.
         metric: the photo had depth, so the mesh is in metres and its size was measured.
-        method: who made the mesh: "depth", "inflate" or "triposr".
+        method: how the mesh was made: "depth", "inflate" or "triposr".
         seen: share of the surface that the photo shows; the rest is guessed.
         picture: a small JPEG of the photo; None = not kept.
     """

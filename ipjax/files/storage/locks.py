@@ -22,7 +22,7 @@ def locked(path: str | Path, *, wait: bool = True) -> Iterator[None]:
         handle = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
         try:
             _take(handle, wait)
-            # Whoever held it before may have removed the file while we waited: then the name belongs to another.
+            # The last holder may have removed the file while we waited: then the name may belong to another file.
             held = _is_same(handle, path)
         except BaseException:
             os.close(handle)

@@ -4,7 +4,7 @@ import dataclasses
 
 
 class WeightsError(ValueError):
-    """The weights cannot be had, or are not what they claim to be; the message is one sentence for the user."""
+    """The weights are missing, unreadable or not the published ones; the message is one sentence for the user."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,7 +19,7 @@ from ipjax.files.storage.locks import locked
 from ipjax.files.storage.writing import publish, write_text
 from ipjax.files.weights.catalogue import Source, WeightsError
 from ipjax.files.weights.hashes import hash_file
-from ipjax.files.weights.local import Resolved, check_published, find_cached, name_recorded
+from ipjax.files.weights.local import Resolved, check_published, checksum_path, find_cached
 from ipjax.progress import bar
 
 _log = logging.getLogger("ipjax.weights")
@@ -39,7 +39,7 @@ def download_file(source: Source, *, attempts: int = 3, timeout: float = 30.0) -
 
 @contextlib.contextmanager
 def _one_at_a_time(source: Source) -> Iterator[Resolved | None]:
-    """One process at a time fetches a file; who waited for another's finds what that one fetched."""
+    """Only one process at a time fetches a file; one that had to wait is given the file that the other fetched."""
     target = cache_folder("weights") / source.file
     target.parent.mkdir(parents=True, exist_ok=True)
     lock = target.with_name(f".{target.name}.lock")
@@ -67,7 +67,7 @@ def _download(source: Source, target: Path, attempts: int, timeout: float) -> Re
             f"what {source.url} sent is not the published file: its sha256 is {found}, expected {source.sha256}"
         )
     if source.sha256 is None:
-        write_text(name_recorded(target), f"{found}  {target.name}\n")
+        write_text(checksum_path(target), f"{found}  {target.name}\n")
         _log.warning("no published sha256 for %s: recorded %s at this first download", source.name, found)
     publish(part, target)
     return Resolved(target, "download", source.name, source.preset, found, source.sha256 is not None)
@@ -87,7 +87,7 @@ def _open(part: Path, mode: str) -> IO[bytes]:
 def _receive(source: Source, part: Path, attempts: int, timeout: float) -> None:
     """The whole file into ``part``, going on from what is there; OSError, in one sentence, when the network fails."""
     assert source.url is not None
-    trouble = "the connection closed early"
+    reason = "the connection closed early"
     for _ in range(attempts):
         start = part.stat().st_size if part.is_file() else 0
         request = urllib.request.Request(source.url, headers={"User-Agent": "ipjax"})
@@ -120,11 +120,11 @@ def _receive(source: Source, part: Path, attempts: int, timeout: float) -> None:
         except _DiskError:
             raise
         except (OSError, ValueError, http.client.HTTPException) as error:  # URLError and timeouts are OSErrors
-            trouble = str(getattr(error, "reason", error))
-            if not (part.is_file() and part.stat().st_size > start):  # no progress: no sense in another try
-                raise OSError(f"{source.url} cannot be reached: {trouble}") from None
+            reason = str(getattr(error, "reason", error))
+            if not (part.is_file() and part.stat().st_size > start):  # no progress: another try would not help
+                raise OSError(f"{source.url} cannot be reached: {reason}") from None
     else:
-        raise OSError(f"the download of {source.url} stopped early ({trouble}); run it again to go on") from None
+        raise OSError(f"the download of {source.url} stopped early ({reason}); run it again to go on") from None
 
 
 def fetch_package(source: Source) -> Resolved:

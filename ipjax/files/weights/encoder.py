@@ -49,7 +49,7 @@ def load_encoder(
 def verify(path_or_name: str | Path | None = None) -> Resolved:
     """Check a file to the end: its sha256 where one is published, its names, its shapes, that its values are finite."""
     found = locate(path_or_name, download=False)
-    if (sha256 := hash_file(found.path)) != found.sha256:  # what was remembered is not asked here
+    if (sha256 := hash_file(found.path)) != found.sha256:  # hashed anew: the cached hash is what is checked
         raise WeightsError(
             f"{found.path} is damaged: its sha256 is {sha256} and was {found.sha256}, although its size and times say "
             "that nothing has changed; remove it and fetch it again"

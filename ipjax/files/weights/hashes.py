@@ -11,8 +11,8 @@ from ipjax.files.storage.cache import cache_folder
 from ipjax.files.storage.parsing import read_json
 from ipjax.files.storage.writing import write_text
 
-_REMEMBERED_FROM = 2**22  # bytes from which a file's sha256 is remembered
-_SETTLED = 2_000_000_000  # nanoseconds since its last change, after which another one shows in its times
+_CACHED_FROM = 2**22  # bytes from which a file's sha256 is remembered
+_SETTLED = 2_000_000_000  # nanoseconds since the last change, after which a further one changes the file's times
 
 
 def hash_file(path: str | Path) -> str:
@@ -21,14 +21,14 @@ def hash_file(path: str | Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def recall_hash(path: str | Path) -> str:
-    """`hash_file`, remembered in the cache for as long as a large file's size and times stay what they were.
+def cached_hash(path: str | Path) -> str:
+    """`hash_file`, kept in the cache for a large file as long as its size and times stay the same.
 
-    A file that was changed a moment ago is hashed and not remembered: another change could leave its times alone.
+    A file that was changed a moment ago is hashed and not kept: another change now could leave its times the same.
     """
     path = Path(path).resolve()
     status = path.stat()
-    if status.st_size < _REMEMBERED_FROM:
+    if status.st_size < _CACHED_FROM:
         return hash_file(path)
     state = {"path": str(path), "size": status.st_size, "changed": [status.st_mtime_ns, status.st_ctime_ns]}
     kept = cache_folder("hashes") / f"{hashlib.sha256(str(path).encode()).hexdigest()[:32]}.json"

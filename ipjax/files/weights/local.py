@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ipjax.files.storage.cache import cache_folder
 from ipjax.files.weights.catalogue import CATALOGUE, Source, WeightsError
-from ipjax.files.weights.hashes import recall_hash
+from ipjax.files.weights.hashes import cached_hash
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,16 +28,16 @@ class Resolved:
         )
 
 
-def name_recorded(path: Path) -> Path:
-    """The file beside some weights that holds the checksum of their first download."""
+def checksum_path(path: Path) -> Path:
+    """Where the checksum of weights without a published one is recorded at their first download: next to them."""
     return path.with_name(path.name + ".sha256")
 
 
 def check_published(path: Path, source: Source, how: str) -> Resolved:
     """Compare a file's sum with the published one, else with the one recorded at its first download."""
-    found, expected = recall_hash(path), source.sha256
-    if expected is None and name_recorded(path).is_file():
-        expected = name_recorded(path).read_text().split()[0]
+    found, expected = cached_hash(path), source.sha256
+    if expected is None and checksum_path(path).is_file():
+        expected = checksum_path(path).read_text().split()[0]
     if expected is not None and found != expected:
         raise WeightsError(
             f"{path} is not the file that was published as {source.name}: its sha256 is {found}, expected {expected}; "

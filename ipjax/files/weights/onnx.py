@@ -1,4 +1,4 @@
-"""Reading tensors out of an ONNX file with a reader of its protobuf encoding that knows five message types and no more.
+"""Tensors of an ONNX file, by a reader of its protobuf encoding for the five message types that they need.
 
 Wire format: https://protobuf.dev/programming-guides/encoding; field numbers: ``onnx/onnx.proto`` of
 https://github.com/onnx/onnx.

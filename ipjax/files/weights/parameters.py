@@ -44,7 +44,7 @@ _HUGGING_FACE_NAMES = [
 def rename(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Hugging Face's names → the official ones, queries, keys and values joined; official names pass unchanged.
 
-    A name of neither scheme passes too, for `build_model` to refuse; WeightsError when two names mean the same
+    A name of neither scheme passes unchanged, and `build_model` refuses it; WeightsError when two names mean the same
     parameter.
     """
     renamed: dict[str, np.ndarray] = {}

@@ -62,7 +62,7 @@ def _strided(storage: Any, offset: Any, shape: Any, strides: Any) -> np.ndarray:
 
 
 def _unpickle(program: bytes, load: Callable[[str, np.dtype], np.ndarray]) -> Any:
-    # Made anew for each file, so that a program which alters what it may call alters nothing that lives on.
+    # New functions and classes for each file: a program that alters them alters nothing that others use.
     def rebuild(storage, offset, shape, strides, *_):
         return _strided(storage, offset, shape, strides)
 

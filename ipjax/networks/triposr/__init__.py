@@ -1,8 +1,8 @@
 """TripoSR in Flax (nnx): one photo to a triplane, and the field of density and colour that the triplane holds.
 
 The published model (https://github.com/VAST-AI-Research/TripoSR, MIT): DINO ViT-B/16 tokens of the photo (`vision`),
-learned triplane tokens, a transformer that lets the second look at the first, an up-sampler, and a small MLP that turns
-what the three planes say about a point into density and colour (`model`). `field` and `renderer` read the triplane,
+learned triplane tokens, a transformer in which these attend to the photo's, an up-sampler, and a small MLP from the
+three planes' features of a point to density and colour (`model`). `field` and `renderer` sample the triplane,
 `weights` maps the published checkpoint to our parameters. Everything is written for one photo; the caller vmaps.
 
 Frame of the field, here called ``mesh``: right-handed, +x towards the input camera, +y to the image's right, +z up;

@@ -10,7 +10,7 @@ from ipjax.networks.triposr.model import TripoSR
 
 
 def sample_planes(triplane: Float[Array, "3 c h w"], points: Float[Array, "n 3"], radius: float) -> Float[Array, "n f"]:
-    """What the planes (x, y), (x, z), (y, z) say about points: bilinear, zero outside, plane after plane.
+    """Features of points in the planes (x, y), (x, z), (y, z): bilinear, zero outside, concatenated.
 
     The first coordinate runs along a plane's width, the second along its height; points in mesh units.
     """
@@ -44,7 +44,7 @@ def query(
 ) -> tuple[Float[Array, "n"], Float[Array, "n 3"]]:
     """Density and colour in [0, 1] at points in mesh units, ``chunk`` (static) points at a time.
 
-    Outside the cube the planes say nothing and the density is a constant that may lie above the threshold: mask it.
+    Outside the cube all features are zero, and the density is a constant that may lie above the threshold: mask it.
     """
 
     def one(point: Float[Array, "3"]) -> Float[Array, "4"]:

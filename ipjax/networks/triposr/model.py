@@ -13,7 +13,7 @@ from ipjax.networks.triposr.vision import VisionTokenizer
 
 
 class BackboneBlock(nnx.Module):
-    """Triplane tokens look at each other, then at the photo, then pass a gated MLP."""
+    """Triplane tokens attend to each other, then to the photo, then pass a gated MLP."""
 
     def __init__(self, config: TripoSRConfig, *, rngs: nnx.Rngs):
         width, dtype = config.width, config.dtype
@@ -74,7 +74,7 @@ class Upsampler(nnx.Module):
 
 
 class Decoder(nnx.Module):
-    """What the three planes say about a point → raw density and three raw colours; always float32."""
+    """The three planes' features of a point → raw density and three raw colours; always float32."""
 
     def __init__(self, config: TripoSRConfig, *, rngs: nnx.Rngs):
         widths = [3 * config.plane_channels, *[config.decoder_width] * config.decoder_layers, 4]

@@ -1,1 +1,1 @@
-"""From one photo to a mesh: by TripoSR, or without learned weights; a file a method, one record they all return."""
+"""From one photo to a mesh: by TripoSR, or without learned weights. A module per method; all return one record."""

@@ -40,7 +40,7 @@ def complete_depth(
     """The measured front of the object, in metres, with a guessed back; ``seen`` tells the two apart.
 
     Args:
-        depth: along z, metres, 0 = unknown, as large as the photo; outside the mask it tells which space is free.
+        depth: along z, metres, 0 = unknown, as large as the photo; outside the mask it shows which space is free.
         back: "mirror" (the plane that the photo contradicts least), "inflate", or "auto": inflate, unless a plane that
             measured surface supports and the photo hardly contradicts says that the object is clearly thinner. (On
             18 objects of YCB-V mirroring always was worse than inflating, 2.9 and 4.3 % of the diameter where
@@ -95,8 +95,8 @@ def isolate_depth(depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
     size = np.hypot(np.ptp(rows) + 1, np.ptp(columns) + 1) * middle / focal
     good &= np.abs(depth - middle) < size
     known = np.where(good, depth, 0).astype(np.float32)
-    # Cut where depth jumps, and keep the pieces that are large and not behind the object: what a mask's edge catches of
-    # the background, and flying pixels between, would become spikes.
+    # Split where depth jumps, and keep the pieces that are large and not behind the object: the background inside the
+    # mask's edge, and flying pixels before it, would become spikes.
     low = cv2.erode(np.where(good, known, 1e3).astype(np.float32), np.ones((3, 3), np.uint8))
     high = cv2.dilate(known, np.ones((3, 3), np.uint8))
     calm = good & (high - low < 0.004 + 0.05 * size)
@@ -118,14 +118,14 @@ def _resample(known: np.ndarray, outline: Outline) -> tuple[np.ndarray, np.ndarr
     weight = cv2.GaussianBlur((known > 0).astype(np.float64), (0, 0), sigma)
     total = cv2.GaussianBlur(known.astype(np.float64), (0, 0), sigma)
     value = look_up(np.where(weight > 1e-3, total / np.maximum(weight, 1e-3), 0).astype(np.float32), outline.pixels)
-    sure = (look_up((weight > 0.4).astype(np.float32), outline.pixels) > 0.99) & outline.inside
-    if not sure.any():
+    reliable = (look_up((weight > 0.4).astype(np.float32), outline.pixels) > 0.99) & outline.inside
+    if not reliable.any():
         raise ValueError("the depth on the object is too scattered to make a surface of")
-    near = solve_poisson(value.astype(np.float64), sure, outline.inside)
+    near = solve_poisson(value.astype(np.float64), reliable, outline.inside)
     # Nodes on the outline take the depth of the nearest node inside.
     near = near[find_nearest_inside(outline.inside)]
-    touched = cv2.dilate(sure.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return near, np.where(outline.inside, sure, touched)
+    touched = cv2.dilate(reliable.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return near, np.where(outline.inside, reliable, touched)
 
 
 def _inflated_thickness(outline: Outline, near: np.ndarray, cell: float, roundness: float) -> np.ndarray:

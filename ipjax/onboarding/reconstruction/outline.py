@@ -100,10 +100,10 @@ def solve_poisson(values: np.ndarray, known: np.ndarray, domain: np.ndarray, sou
     diagonal, right = np.full(len(own), 1e-9), np.full(len(own), float(source))
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
         shifted = np.roll(padded, (-dy, -dx), (0, 1))[1:-1, 1:-1][free]
-        there = np.roll(domain_, (-dy, -dx), (0, 1))[1:-1, 1:-1][free]
+        neighbours = np.roll(domain_, (-dy, -dx), (0, 1))[1:-1, 1:-1][free]
         given = np.roll(known_, (-dy, -dx), (0, 1))[1:-1, 1:-1][free]
         value = np.roll(values_, (-dy, -dx), (0, 1))[1:-1, 1:-1][free]
-        diagonal += there
+        diagonal += neighbours
         right += np.where(given, value, 0.0)
         linked = shifted >= 0
         rows.append(own[linked])

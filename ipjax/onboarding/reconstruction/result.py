@@ -1,4 +1,4 @@
-"""What every way from a photo to a mesh returns."""
+"""What every method of reconstruction returns."""
 
 import dataclasses
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Two sheets over the photo's pixels, front and back, sewn along the outline into one closed, textured mesh."""
+"""Two sheets over the photo's pixels, front and back, joined along the outline into one closed, textured mesh."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +28,7 @@ def join_sheets(
     ``back_pixels`` [r c 2] are the places of the photo whose colours the back takes; ``seen`` [r c] is 1 where the
     front was seen; ``camera`` is the photo's focal lengths and centre, pixels.
     """
-    used, faces = _sew(outline.cells)
+    used, faces = _stitch(outline.cells)
     vertices = np.concatenate([front.reshape(-1, 3)[used], back.reshape(-1, 3)[used]])
     texture, (left, top) = _continue_texture(rgb, mask)
     height, width = texture.shape[:2]
@@ -56,7 +56,7 @@ def join_sheets(
     )
 
 
-def _sew(cells: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "m 3"]]:
+def _stitch(cells: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "m 3"]]:
     """Indices of the used nodes, and faces over front (0 … k − 1) and back (k … 2k − 1) vertices, outwards."""
     height, width = cells.shape[0] + 1, cells.shape[1] + 1
     node = np.arange(height * width).reshape(height, width)
@@ -66,8 +66,8 @@ def _sew(cells: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "m 3
     front = front.reshape(-1, 3)
     count = len(used)
     edges = np.concatenate([front[:, [0, 1]], front[:, [1, 2]], front[:, [2, 0]]])
-    there, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    u, v = edges[~np.isin(there, back)].T
+    forward, reverse = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    u, v = edges[~np.isin(forward, reverse)].T
     wall = np.concatenate([np.stack([v, u, u + count], -1), np.stack([v, u + count, v + count], -1)])
     return used, np.concatenate([front, front[:, ::-1] + count, wall])
 
@@ -79,9 +79,9 @@ def _continue_texture(rgb: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, tu
     rows, columns = np.nonzero(mask)
     top, left = max(rows.min() - 4, 0), max(columns.min() - 4, 0)
     crop = np.s_[top : rows.max() + 5, left : columns.max() + 5]
-    sure = np.asarray(binary_erosion(mask[crop], iterations=1))  # pixels at the edge mix object and background
-    sure = sure if sure.any() else mask[crop]
-    return rgb[crop][find_nearest_inside(sure)], (int(left), int(top))
+    interior = np.asarray(binary_erosion(mask[crop], iterations=1))  # pixels at the edge mix object and background
+    interior = interior if interior.any() else mask[crop]
+    return rgb[crop][find_nearest_inside(interior)], (int(left), int(top))
 
 
 def focal_and_centre(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

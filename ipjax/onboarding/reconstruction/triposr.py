@@ -1,4 +1,4 @@
-"""TripoSR's part: its weights, its mesh of a photo, and the surface of its density field."""
+"""Reconstruction by TripoSR: its weights, its mesh of a photo, and the surface of its density field."""
 
 import dataclasses
 import os
@@ -13,7 +13,7 @@ from ipjax.files.storage.cache import cache_folder
 from ipjax.files.weights.catalogue import Source, WeightsError
 from ipjax.files.weights.downloading import download_file
 from ipjax.files.weights.finding import is_offline
-from ipjax.files.weights.hashes import recall_hash
+from ipjax.files.weights.hashes import cached_hash
 from ipjax.files.weights.local import Resolved
 from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
 from ipjax.records import Camera, Similarity
@@ -46,11 +46,11 @@ def resolve_triposr(
         path = Path(explicit).expanduser()
         if not path.is_file():
             raise WeightsError(f"there is no weights file at {path}")
-        found = recall_hash(path)
+        found = cached_hash(path)
         return Resolved(path, "explicit", TRIPOSR.name, TRIPOSR.preset, found, found == TRIPOSR.sha256)
     cached = cache_folder("weights") / TRIPOSR.file
     if cached.is_file():
-        found = recall_hash(cached)
+        found = cached_hash(cached)
         if found != TRIPOSR.sha256:
             raise WeightsError(
                 f"{cached} is not the published file: its sha256 is {found}, expected {TRIPOSR.sha256}; "
@@ -86,9 +86,10 @@ def load_triposr(path: str | Path, *, dtype: str = "float32") -> "TripoSR":
 def reconstruct_with_triposr(
     model: "TripoSR", foreground: "Foreground", *, resolution: int = 256, progress: Progress | None = None
 ) -> Reconstruction:
-    """TripoSR's mesh of a photo, with vertex colours; arbitrary scale, all of it a guess but what the photo shows.
+    """TripoSR's mesh of a photo, with vertex colours; its scale is arbitrary, and unseen surface is guessed.
 
-    The camera is the model's own: it is told nothing of the photo's. Raises ValueError when the field has no surface.
+    The camera is the one that the model assumes: it does not take the photo's. Raises ValueError when the field has no
+    surface.
     """
     import jax.numpy as jnp
     from flax import nnx

@@ -1,4 +1,4 @@
-"""What will make an object's poses ambiguous, measured before anyone relies on it."""
+"""What will make an object's poses ambiguous, measured when it is onboarded."""
 
 import dataclasses
 
@@ -12,15 +12,15 @@ from ipjax.networks.dinov2 import Encoder
 from ipjax.records import Similarity, Templates
 
 STEPS = 12  # turns about each axis
-TILT = 25.0  # degrees above and below the equator from which the turns are seen: one end alone can hide what turns
+TILT = 25.0  # degrees above and below the equator of the views: from one end alone a turn may not show
 THIN = 0.12  # shortest side of the smallest box over its middle one
 TEXTURELESS = 2.0  # CIELAB units: median spread of colour in small windows, below which there is no texture
-ALIKE = 0.8  # of the likeness of neighbouring views; turned views that are less alike can be told apart
+ALIKE = 0.8  # share of the similarity of neighbouring views; turned views below it are distinguishable
 
 
 @dataclasses.dataclass(frozen=True)
 class Findings:
-    """What was measured of an object before anyone relies on it."""
+    """Properties of an onboarded object that make its poses ambiguous or uncertain."""
 
     turns: Float[np.ndarray, "3 k"]  # likeness of views turned by k · 360° / STEPS about each box axis; at 0 it is 1
     ambiguous: tuple[tuple[int, ...], ...]  # for each axis the turns, degrees, that look the same
@@ -91,11 +91,11 @@ def measure_turns(
             ends = []
             for end in range(2):
                 f, v = features[axis, end], valid[axis, end]
-                other, there = np.roll(f, -k, axis=0), np.roll(v, -k, axis=0)
-                both, either = v & there, v | there
+                other, other_valid = np.roll(f, -k, axis=0), np.roll(v, -k, axis=0)
+                both, either = v & other_valid, v | other_valid
                 cosine = np.where(both, (f * other).sum(-1), 0)
                 ends.append(cosine.sum(-1) / np.maximum(either.sum(-1), 1))
-            # It is enough that the turn shows from one end: then the object is not symmetric.
+            # The lower of the two: where a turn shows from either end, the object is not symmetric.
             found[axis, k] = min(np.mean(one) for one in ends)
     return found
 

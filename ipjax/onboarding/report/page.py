@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing beside it: what the template shows, put together."""
+"""The report as one self-contained HTML page: the values that its template shows."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

@@ -14,7 +14,7 @@ from ipjax.files.weights import encoder as encoders
 from ipjax.files.weights import finding, hashes
 from ipjax.files.weights.catalogue import CATALOGUE, OFFICIAL, Source, WeightsError
 from ipjax.files.weights.encoder import default_block, load_encoder, verify
-from ipjax.files.weights.hashes import recall_hash
+from ipjax.files.weights.hashes import cached_hash
 from ipjax.files.weights.matching import load_matching_encoder
 from ipjax.networks.dinov2 import PRESETS, find_preset
 
@@ -62,12 +62,12 @@ def age(path: Path, seconds: float) -> None:
 def test_a_file_is_hashed_once_for_as_long_as_it_stays_as_it_is(tmp_path, weights_cache, count, monkeypatch):
     monkeypatch.setattr(hashes, "_SETTLED", 0)
     path = tmp_path / "large.pth"
-    data = bytearray(hashes._REMEMBERED_FROM)
+    data = bytearray(hashes._CACHED_FROM)
 
     def ask() -> tuple[bool, int]:
         """Whether the sum is right, and how often the file was read for it."""
         before = count["hash_file"]
-        return recall_hash(path) == hashlib.sha256(data).hexdigest(), count["hash_file"] - before
+        return cached_hash(path) == hashlib.sha256(data).hexdigest(), count["hash_file"] - before
 
     path.write_bytes(data)
     assert ask() == (True, 1) and ask() == (True, 0)
@@ -87,7 +87,7 @@ def test_a_file_is_hashed_once_for_as_long_as_it_stays_as_it_is(tmp_path, weight
         kept.write_text(damaged)
         assert ask() == (True, 1) and ask() == (True, 0)
     (tmp_path / "small.pth").write_bytes(b"x")
-    recall_hash(tmp_path / "small.pth")
+    cached_hash(tmp_path / "small.pth")
     assert len(list((weights_cache.parent / "hashes").iterdir())) == 1
     monkeypatch.setattr(hashes, "_SETTLED", 3600 * 10**9)  # what was changed a moment ago may change again unseen
     path.write_bytes(data)
@@ -97,7 +97,7 @@ def test_a_file_is_hashed_once_for_as_long_as_it_stays_as_it_is(tmp_path, weight
 def test_verify_does_not_trust_what_is_remembered(tmp_path, monkeypatch):
     path = tmp_path / "a.safetensors"
     save_file(random_tensors(TINY), path)
-    monkeypatch.setattr(finding, "recall_hash", lambda _: "0" * 64)
+    monkeypatch.setattr(finding, "cached_hash", lambda _: "0" * 64)
     with pytest.raises(WeightsError, match="is damaged: its sha256 is"):
         verify(path)
 

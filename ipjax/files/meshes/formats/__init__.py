@@ -1,1 +1,1 @@
-"""Mesh formats: each is read into parts with one look each."""
+"""Mesh formats: each is read into parts, of one texture or one kind of colour each."""

@@ -150,7 +150,7 @@ class Document:
         path = self.source.find(uri, quoted=True)
         if path is None:
             raise ValueError(f"names {uri[:200]}, which is missing")
-        return self.source.read_beside(path)
+        return self.source.read_companion(path)
 
     def view(self, index: Any) -> tuple[bytes, int, int, int]:
         """The buffer of a view, its first byte, its length, its stride (0 = none)."""

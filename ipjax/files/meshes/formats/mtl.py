@@ -48,7 +48,7 @@ def find_materials(source: Source, libraries: list[bytes], wanted: dict[bytes, i
 
 def read_mtl(source: Source, path: Path) -> dict[bytes, Material]:
     """The materials of an MTL file by their names, which are compared as bytes."""
-    data = source.read_beside(path).removeprefix(BYTE_ORDER_MARK)
+    data = source.read_companion(path).removeprefix(BYTE_ORDER_MARK)
     source.take(4 * len(data), path.name)
     found: dict[bytes, Material] = {}
     if data.startswith(LFS_POINTER):

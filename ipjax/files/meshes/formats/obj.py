@@ -36,8 +36,8 @@ def read_obj(source: Source) -> list[Part]:
     """The parts of an OBJ file, one per texture and one for what has none. Raises ValueError in a sentence."""
     data = source.read().removeprefix(BYTE_ORDER_MARK)
     source.take(len(data), "its text")
-    vertices, places = Table(7), Table(2)
-    faces: list[np.ndarray] = []  # [m 3 2]: vertex and place of every corner, from 0
+    vertices, uvs = Table(7), Table(2)
+    faces: list[np.ndarray] = []  # [m 3 2]: vertex and texture coordinate of every corner, from 0
     owner: list[np.ndarray] = []
     materials: dict[bytes, int] = {}
     libraries: list[bytes] = []
@@ -50,10 +50,10 @@ def read_obj(source: Source) -> list[Part]:
                 vertices.add(rows)
             elif kind == b"vt":
                 rows = read_rows(group, 1, 3)[:, :2]
-                source.take(16 * len(rows), f"{places.count + len(rows):,} texture coordinates")
-                places.add(rows)
+                source.take(16 * len(rows), f"{uvs.count + len(rows):,} texture coordinates")
+                uvs.add(rows)
             elif kind == b"f":
-                rows = read_faces(group, vertices.count, places.count)
+                rows = read_faces(group, vertices.count, uvs.count)
                 count += len(rows)
                 check_faces(count)
                 source.take(80 * len(rows), f"{count:,} faces")
@@ -69,10 +69,10 @@ def read_obj(source: Source) -> list[Part]:
     corners = np.concatenate(faces)
     if corners[:, :, 0].max() >= vertices.count:
         raise ValueError(f"a face names vertex {corners[:, :, 0].max() + 1} of {vertices.count}")
-    # A place that is not there costs a corner its texture, not the mesh.
-    corners[:, :, 1][corners[:, :, 1] >= places.count] = NONE
-    looks = find_materials(source, libraries, materials)
-    return assemble(source, vertices.whole(), places.whole(), corners, np.concatenate(owner), looks)
+    # A texture coordinate that does not exist costs a corner its texture; the mesh is still read.
+    corners[:, :, 1][corners[:, :, 1] >= uvs.count] = NONE
+    found = find_materials(source, libraries, materials)
+    return assemble(source, vertices.whole(), uvs.whole(), corners, np.concatenate(owner), found)
 
 
 # --- text ------------------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def split_blocks(data: bytes) -> Iterator[list[bytes]]:
 def gather(lines: list[bytes]) -> Iterator[tuple[bytes, list[bytes]]]:
     """Lines in runs that can be read together, without their first word: in the order of the file where it matters.
 
-    Vertices and places come before the faces of their run, which name none that come later.
+    Vertices and texture coordinates come before the faces of their run, which name none that come later.
     """
     runs: dict[bytes, list[bytes]] = {b"v": [], b"vt": [], b"f": []}
     backward = False
@@ -163,9 +163,9 @@ def read_rows(lines: list[bytes], least: int, most: int) -> np.ndarray:
     return result
 
 
-def read_faces(lines: list[bytes], vertices: int, places: int) -> np.ndarray:
-    """Corners [m 3 2] of triangles, from 0; a place that a corner lacks is −1. Polygons are cut from their first
-    corner on."""
+def read_faces(lines: list[bytes], vertices: int, uvs: int) -> np.ndarray:
+    """Corners [m 3 2] of triangles: vertex and texture coordinate, from 0, −1 where there is none. Polygons become fans
+    about their first corner."""
     result = []
     groups: dict[int, list[list[bytes]]] = {}
     for line in lines:
@@ -192,7 +192,7 @@ def read_faces(lines: list[bytes], vertices: int, places: int) -> np.ndarray:
                 corners = np.array([[int(a), int(b) if b else 1] for a, b in pairs], np.int64)
         except (ValueError, OverflowError):
             raise ValueError(f"has faces that are not whole numbers: {words[0][:40]!r}") from None
-        for column, total in ((0, vertices), (1, places)):
+        for column, total in ((0, vertices), (1, uvs)):
             mine = corners[:, column]
             mine[:] = np.where(mine < 0, mine + total, mine - 1)
             if column:
@@ -209,7 +209,7 @@ def read_faces(lines: list[bytes], vertices: int, places: int) -> np.ndarray:
 def assemble(
     source: Source,
     table: np.ndarray,
-    places: np.ndarray,
+    uvs: np.ndarray,
     corners: np.ndarray,
     owner: np.ndarray,
     materials: dict[int, Material],
@@ -230,7 +230,7 @@ def assemble(
     placed = (corners[:, :, 1] >= 0).all(axis=1)
     if placed.any() and not textures:
         named = any(material.image for material in materials.values())
-        # Several colours are a look of its own; a single one is what exporters write where they have none.
+        # Several colours are meant to be shown; a single one is what exporters write where they have none.
         painted = len({material.colour for material in materials.values()} - {None}) > 1 and not named
         guess = None if painted else source.guess_texture()
         if guess is not None:
@@ -246,11 +246,11 @@ def assemble(
             continue
         rest &= ~mine
         pairs = corners[mine].reshape(-1, 2)
-        base = len(places) + 1
+        base = len(uvs) + 1
         keys, inverse = np.unique(pairs[:, 0] * base + pairs[:, 1], return_inverse=True)
         source.take_mesh(len(keys), len(pairs) // 3)
         material = materials.get(number, Material())
-        uv = np.clip(np.nan_to_num(places[keys % base]), -1e6, 1e6) * material.scale + material.offset
+        uv = np.clip(np.nan_to_num(uvs[keys % base]), -1e6, 1e6) * material.scale + material.offset
         parts.append(Part(vertices[keys // base], inverse.reshape(-1, 3), uv=uv, texture=texture))
     if rest.any():
         part = paint(source, vertices, corners[rest][:, :, 0], owner[rest], colours, materials)
@@ -259,7 +259,7 @@ def assemble(
 
 
 def read_colours(table: np.ndarray) -> np.ndarray | None:
-    """The colours behind the vertices' places: in [0, 1], or out of 255 where one is larger."""
+    """The colours behind the vertices' coordinates: in [0, 1], or out of 255 where one is larger."""
     values = table[:, 3:6]
     known = np.asarray(np.isfinite(values).all(axis=1))
     if not known.any():

@@ -1,4 +1,4 @@
-"""A part of a mesh file: triangles that share a look."""
+"""A part of a mesh file: triangles that share a texture or a kind of colour."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ GREY = 160  # of what has no colour
 
 @dataclasses.dataclass
 class Part:
-    """Triangles of a file that share a look: a texture, colours per vertex, or nothing."""
+    """Triangles of a file that share an appearance: a texture, colours per vertex, or no colour."""
 
     vertices: Float[np.ndarray, "n 3"]
     faces: Int[np.ndarray, "m 3"]

@@ -38,7 +38,7 @@ class Source:
         self.warnings: list[str] = []
         self.notes: list[str] = []
 
-    # What is asked for is counted before it is allocated.
+    # Memory is counted before it is allocated.
 
     def take(self, count: int, what: str) -> None:
         """Count bytes that are about to be allocated. Raises ValueError where the file has used up its budget."""
@@ -97,8 +97,8 @@ class Source:
             raise ValueError(f"names a file outside its own folder: {outside[:200]}")
         return None
 
-    def read_beside(self, path: Path) -> bytes:
-        """The bytes of a file in the mesh's folder, counted."""
+    def read_companion(self, path: Path) -> bytes:
+        """The bytes of a file that the mesh file names, counted against its budget."""
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise ValueError(f"names a file of {size / 1e9:.1f} GB: {path.name}")
@@ -114,7 +114,7 @@ class Source:
                 path = self.find(name, quoted)
                 if path is None:
                     raise TextureError(f"{shown[:200]} is named but missing")
-                shown, data = path.name, self.read_beside(path)
+                shown, data = path.name, self.read_companion(path)
             texture = open_texture(shown[:200], data)
         except TextureError as error:
             self.warn(f"{error}: shown without that texture")
@@ -141,7 +141,7 @@ class Source:
         images = {path.stem.lower(): path for path in reversed(files) if path.suffix.lower() in IMAGES}
         for name in names:
             if name in images:
-                texture = self.open_texture(images[name].name, self.read_beside(images[name]))
+                texture = self.open_texture(images[name].name, self.read_companion(images[name]))
                 if texture is not None:
                     self.notes.append(f"{images[name].name} beside it is taken for its texture")
                     return texture
