@@ -1,7 +1,7 @@
 """``python -m benchmarks.ablation DATA [--levels 0 2]``: what each step beyond the paper's method is worth.
 
 From the paper's recipe to `Config()`, one step added after the other, on scans and on degraded meshes (``--levels``) or
-on a reconstructed one (``--reconstruction``). Settings of each step are written as JSON beside the results, so a step
+on a reconstructed one (``--reconstruction``). Settings of each step are written as JSON next to the results, so a step
 can be run alone: ``ipjax evaluate DATA --config FILE``. Killed and called again it goes on. Ends with the
 two tables of the page benchmarks/results/ablation.md.
 """

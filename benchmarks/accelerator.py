@@ -6,9 +6,9 @@ Runs on any device; written for GPUs. Five parts, of which ``--only`` chooses:
   ``--answers FILE`` writes them there, or, where the file is there already, compares them with those in it: write
   it on a CPU (``--only answers``), compare on a GPU.
 * queries: seconds of `estimate`, of one query and of many at once.
-* stages: where they go.
+* stages: how those seconds divide among the stages.
 * encoder: seconds of `observe` and of whole queries with DINOv2 S/14 in float32 and bfloat16.
-* neighbours: the forms of the matching kernel beside the bare product.
+* neighbours: the forms of the matching kernel against the bare product.
 
 DINOv2's weights are random unless ``--weights`` names a file. A device takes work before it has done the last: "one by
 one" waits for every answer, "in a row" only for the last.
@@ -35,7 +35,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import neighbours, stages
 from benchmarks.measure import commit, compile_fresh, describe_device, summarise
-from benchmarks.queries import BLOCK, PRESET, Both, whole
+from benchmarks.queries import BLOCK, PRESET, StandInWithDinov2, whole
 from ipjax.config import Config
 from ipjax.estimation.features import observe
 from ipjax.estimation.pipeline import estimate
@@ -55,7 +55,7 @@ NOISE = 0.3  # of the answers' features, whose norm is 1
 
 
 class Session:
-    """What the parts share: sizes, the object, and where answers are."""
+    """What the parts have in common: sizes, the object, the queries, and the file of answers."""
 
     def __init__(self, quick: bool, answers: Path | None, weights: str | None, trace: Path | None, batches=()):
         self.quick, self.answers, self.weights, self.trace = quick, answers, weights, trace
@@ -76,15 +76,15 @@ class Session:
         stack = lambda *x: jnp.stack([np.asarray(part) for part in x])
         self.queries, self.truth = (jax.tree.map(stack, *part) for part in zip(*made, strict=True))
         self.keys = jax.random.split(jax.random.key(0), count)
-        # Made on the processor: thousands of tiny programs are nothing for an accelerator.
+        # Made on the CPU, for it takes thousands of tiny programs, each slow to start on an accelerator.
         on_host = jax.tree.map(np.asarray, (self.templates, self.encoder))
         self.templates, self.encoder = jax.tree.map(jnp.asarray, on_host)
 
     def compile(self, forms: "Forms") -> dict[Any, tuple[Callable, float, int]]:
-        """Every function compiled, by threads, as many as there are processors; nothing is compiled any more then.
+        """Compile every function, in as many threads as there are processors.
 
-        Each is the compiled function, the seconds of its own tracing and compiling, beside the others', and the bytes
-        of its temporary arrays.
+        Returns for each the compiled function, the seconds of tracing and compiling it (while others were compiled),
+        and the bytes of its temporary arrays.
         """
 
         def build(lowered, seconds):
@@ -98,7 +98,7 @@ class Session:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for key, (function, arguments) in forms.items():
                 start = time.perf_counter()
-                # A function of its own: what was compiled before is found again otherwise.
+                # A new function each time, or JAX would find one that was compiled before.
                 lowered = jax.jit(lambda *a, function=function: function(*a)).lower(*arguments)
                 jobs[key] = pool.submit(build, lowered, time.perf_counter() - start)
         return {key: job.result() for key, job in jobs.items()}
@@ -111,8 +111,8 @@ class Session:
         shape = tiny if self.quick else find_preset(PRESET, dtype)
         return Encoder(DinoV2(shape, rngs=nnx.Rngs(0)), min(BLOCK, shape.depth - 1))
 
-    def some(self, count: int):
-        """So many queries and their keys; one alone has no axis. They repeat: times need no others."""
+    def take_batch(self, count: int):
+        """So many queries and their keys, repeated if need be; a single one has no batch axis."""
         if count == 1:
             return take(self.queries, 0), self.keys[0]
         resize = lambda x: jnp.resize(x, (count, *x.shape[1:]))
@@ -161,7 +161,7 @@ def answers(session: Session) -> Iterator[dict[str, Any]]:
 
 
 def features(session: Session, images) -> Iterator[dict[str, Any]]:
-    """DINOv2's features of a few images: float32 beside those of the file, and bfloat16 beside float32."""
+    """DINOv2's features of a few images: float32 against those of the file, and bfloat16 against float32."""
     encode = jax.jit(lambda encoder, images: encoder(images))
     found = {dtype: np.asarray(encode(session.load_dinov2(dtype), images)) for dtype in ("float32", "bfloat16")}
     if session.answers:
@@ -226,7 +226,7 @@ def queries(session: Session) -> Iterator[dict[str, Any]]:
     """Estimates of one query and of many; without an encoder nothing is drawn."""
     forms = {}
     for batch in (1, *session.batches):
-        made = session.some(batch)
+        made = session.take_batch(batch)
         for name, config, encoder in (
             ("Config(), candidates drawn", Config(), session.encoder),
             ("Config()", Config(), None),
@@ -250,7 +250,7 @@ def queries(session: Session) -> Iterator[dict[str, Any]]:
 def staged(session: Session) -> Iterator[dict[str, Any]]:
     """The stages of `Config()`, each compiled alone; `estimate` refines and scores two rounds of hypotheses."""
     templates, config, forms = session.templates, Config(), {}
-    shapes = jax.eval_shape(stages.hypotheses, templates, *session.some(1))
+    shapes = jax.eval_shape(stages.hypotheses, templates, *session.take_batch(1))
     rng, count = np.random.default_rng(0), shapes.scale.shape[0]
     near = jax.tree.map(lambda x, like: jnp.broadcast_to(x, like.shape), take(session.truth, 0), shapes)
     turned = Rotation.from_rotvec(rng.normal(0, 0.1, (count, 3))).as_matrix() @ np.asarray(near.rotation)
@@ -259,7 +259,7 @@ def staged(session: Session) -> Iterator[dict[str, Any]]:
         near, rotation=jnp.asarray(turned, jnp.float32), translation=jnp.asarray(moved, jnp.float32)
     )
     for batch in (1, session.staged):
-        made, keys = session.some(batch)
+        made, keys = session.take_batch(batch)
         start = poses
         if batch > 1:
             start = jax.tree.map(lambda x, batch=batch: jnp.broadcast_to(x, (batch, *x.shape)), poses)
@@ -279,9 +279,9 @@ def encoders(session: Session) -> Iterator[dict[str, Any]]:
     forms = {}
     for dtype in ("float32", "bfloat16"):
         encoder = session.load_dinov2(dtype)
-        both = Both(session.encoder, encoder)
+        both = StandInWithDinov2(session.encoder, encoder)
         for batch in (1, session.staged):
-            made, keys = session.some(batch)
+            made, keys = session.take_batch(batch)
             one = observe if batch == 1 else jax.vmap(observe, (None, 0))
             forms[f"observe, {dtype} encoder", batch] = one, (encoder, made.view)
             one = whole if batch == 1 else jax.vmap(whole, (None, None, 0, 0, None, None))
@@ -445,8 +445,8 @@ def main() -> None:
         for row in RUN[part](session):
             results["parts"].setdefault(part, []).append(row)
             results["seconds"] = time.perf_counter() - begin
-            told = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items() if k != "what"}
-            print(f"[{results['seconds']:4.0f} s] {part}: {row['what']}: {told}", flush=True)
+            values = {k: f"{v:.4g}" if isinstance(v, float) else v for k, v in row.items() if k != "what"}
+            print(f"[{results['seconds']:4.0f} s] {part}: {row['what']}: {values}", flush=True)
             if options.json:
                 write_text(options.json, json.dumps(results, indent=1, ensure_ascii=False) + "\n", parents=True)
             if options.page:

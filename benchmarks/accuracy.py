@@ -2,7 +2,7 @@
 
 For each target of a data set in BOP layout, with its annotated mask and the object onboarded from its scan (so that the
 scale is unknown): rotation error (degrees, to the nearest symmetric pose), translation error (mm), scale error (%),
-ADD-S / diameter; `Config()` beside `Config.paper()`. Results stay in ``--output``: killed and called again, it goes on.
+ADD-S / diameter; `Config()` next to `Config.paper()`. Results stay in ``--output``: if killed, call it again.
 
 ``--mesh 5=mesh.obj --alignment 5=map.json --models ycbv`` does the same for a reconstructed mesh, through the
 evaluation-only alignment, tells the angle between the estimated and the true long axis, and draws the overlay.
@@ -121,8 +121,8 @@ def main() -> None:
     by_config = [score.instances for score, _ in runs.values()]
     for instances in zip(*by_config, strict=True):
         one = instances[0]
-        told = " | ".join(" ".join(f"{c:>8}" for c in cells(i, diameters[i.obj_id])) for i in instances)
-        print(f"{one.scene_id:>5} {one.im_id:>6} {one.obj_id:>6} {told}")
+        cells_text = " | ".join(" ".join(f"{c:>8}" for c in cells(i, diameters[i.obj_id])) for i in instances)
+        print(f"{one.scene_id:>5} {one.im_id:>6} {one.obj_id:>6} {cells_text}")
     figures = {name: summary(score, diameters) for name, (score, _) in runs.items()}
     for name, entry in figures.items():
         print(

@@ -2,7 +2,7 @@
 
 An ellipsoid is drawn by a formula, at a random pose, size and place in an image of 640 × 480, and goes the way of every
 query: ``frame``, ``observe``, ``estimate``, at the defaults (crops of 224², a grid of 56²). No image holds noise, so
-what the mean error is not, over many of them, is zero only if no stage moves things. Four stages are looked at: the
+the mean error over many of them is zero only if no stage is biased. Four stages are measured: the
 mask's border on the grid (``contour``), ``refine`` from the truth, the whole ``estimate``, and ``frame`` at image sizes
 from 640 to 4096 pixels, odd ones included. A mean farther from zero than three standard errors is a bias.
 """
@@ -45,7 +45,7 @@ def rotation_error(found, truth) -> float:
 
 
 def contour_errors(cloud, truth) -> np.ndarray:
-    """How far the traced border as a whole is moved (x, y) and too large, in % of the diameter."""
+    """How far the traced border is shifted (x, y) and enlarged, in % of the diameter."""
     focal, centre = np.asarray(cloud.camera.focal, np.float64), np.asarray(cloud.camera.centre, np.float64)
     points = np.asarray(cloud.contour.points, np.float64)[np.asarray(cloud.contour.valid)]
     conic = problems.outline_conic(truth, focal, centre)
@@ -109,12 +109,12 @@ def summary(errors: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return table.mean(axis=0), table.std(axis=0, ddof=1) / np.sqrt(len(table))
 
 
-def tell(mean: float, error: float, digits: int) -> str:
-    """Mean ± standard error, set in bold where it is no chance."""
+def format_mean(mean: float, error: float, digits: int) -> str:
+    """Mean ± standard error, in bold where the mean is farther from zero than three standard errors."""
     if not np.isfinite(mean):
         return ""
-    told = f"{mean:+.{digits}f} ± {error:.{digits}f}"
-    return f"**{told}**" if abs(mean) > 3 * error else told
+    text = f"{mean:+.{digits}f} ± {error:.{digits}f}"
+    return f"**{text}**" if abs(mean) > 3 * error else text
 
 
 def measure_poses(scenes: int, directions: int, rolls: int) -> list[str]:
@@ -122,7 +122,7 @@ def measure_poses(scenes: int, directions: int, rolls: int) -> list[str]:
     templates = problems.make_templates(directions, rolls, grid=GRID)
     templates = eqx.tree_at(lambda t: t.surface, templates, problems.make_surface(2048))
     encoder, config = problems.make_encoder(), Config()
-    look = jax.jit(observe)
+    observe_compiled = jax.jit(observe)
     reduce = jax.jit(lambda query: SceneGrid(query, config.score.resolution, config.refine.silhouette).cloud)
     fit = jax.jit(lambda cloud, pose: refine(templates.surface, cloud, pose, config.refine)[0])
     find = jax.jit(ipjax.estimate)
@@ -131,7 +131,7 @@ def measure_poses(scenes: int, directions: int, rolls: int) -> list[str]:
     for seed in range(scenes):
         scene = problems.make_frame(seed)
         view = ipjax.frame(scene.rgb, scene.depth, scene.mask, scene.matrix, resolution=RESOLUTION)
-        query, truth = look(encoder, view), scene.camera_from_object
+        query, truth = observe_compiled(encoder, view), scene.camera_from_object
         cloud = reduce(query)
         errors["contour"].append(contour_errors(cloud, truth))
         for name, pose in (
@@ -147,11 +147,11 @@ def measure_poses(scenes: int, directions: int, rolls: int) -> list[str]:
         "|---|---|---|---|---|---|---|---|",
     ]
     for name, found in errors.items():
-        told = [tell(m, e, 3) for m, e in zip(*summary(found), strict=True)]
+        text = [format_mean(m, e, 3) for m, e in zip(*summary(found), strict=True)]
         offset = np.linalg.norm(np.array(found)[:, :2] if name == "contour" else np.array(found)[:, :3], axis=1)
         rotation = f"{np.median(turned[name]):.2f}°" if turned[name] else ""
         far = f"{np.median(offset):.3f} | {np.quantile(offset, 0.9):.3f}"
-        lines.append(f"| {name} | {' | '.join(told)} | {far} | {rotation} |")
+        lines.append(f"| {name} | {' | '.join(text)} | {far} | {rotation} |")
     return lines
 
 
@@ -163,11 +163,11 @@ def measure_frames(scenes: int) -> list[str]:
     ]
     for width, height in SIZES:
         found = [frame_errors(seed, width, height) for seed in range(scenes)]
-        told = []
+        text = []
         for what, columns in (("depth", 2), ("colours", 2), ("mask", 3)):
             mean, error = summary([one[what] for one in found])
-            told += [tell(m, e, 3) for m, e in zip(mean[:columns], error[:columns], strict=True)]
-        lines.append(f"| {width} × {height} | {' | '.join(told)} |")
+            text += [format_mean(m, e, 3) for m, e in zip(mean[:columns], error[:columns], strict=True)]
+        lines.append(f"| {width} × {height} | {' | '.join(text)} |")
         print(f"  {lines[-1]}", file=sys.stderr, flush=True)
     return lines
 

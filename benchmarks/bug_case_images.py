@@ -1,7 +1,7 @@
 """``python -m benchmarks.bug_case_images FOLDER``: what is read from each camera, mask and depth file of FOLDER.
 
 FOLDER holds camera/, mask_*/ and depth_endian/, as small files that other people's reports describe. A line per file:
-what was read, what was said beside it, or the sentence of refusal.
+what was read and the warnings, or the sentence of refusal.
 """
 
 import argparse
@@ -21,7 +21,7 @@ SIZE = (640, 480)  # of the images that the cameras and masks were made for
 K = np.array([[1066.778, 0, 312.9869], [0, 1067.487, 241.3109], [0, 0, 1]])
 
 
-class _Said(logging.Handler):
+class _LogLines(logging.Handler):
     def __init__(self):
         super().__init__()
         self.lines: list[str] = []
@@ -38,7 +38,7 @@ def main() -> int:
     if not (folder / "camera").is_dir():
         print(f"{folder}: it has no folder camera/", file=sys.stderr)
         return 2
-    said = _Said()
+    said = _LogLines()
     logging.getLogger("ipjax").addHandler(said)
     for path in sorted((folder / "camera").iterdir()):
         _row(path, said, _camera)
@@ -49,35 +49,35 @@ def main() -> int:
     return 0
 
 
-def _row(path: Path, said: _Said, read) -> None:
+def _row(path: Path, said: _LogLines, read) -> None:
     said.lines.clear()
     try:
-        told = read(path)
+        text = read(path)
     except Exception as error:
-        told = f"{'' if isinstance(error, ValueError) else type(error).__name__ + ': '}{error}"
-        told = "refused: " + told.replace(f"{path}: ", "").split("\n")[0]
+        text = f"{'' if isinstance(error, ValueError) else type(error).__name__ + ': '}{error}"
+        text = "refused: " + text.replace(f"{path}: ", "").split("\n")[0]
     warned = "".join(f"; WARNING {line}" for line in said.lines)
-    print(f"| {path.parent.name}/{path.name} | {told}{warned} |")
+    print(f"| {path.parent.name}/{path.name} | {text}{warned} |")
 
 
 def _camera(path: Path) -> str:
     camera = read_camera(path)
     (fx, _, cx), (_, fy, cy) = camera.matrix[:2]
-    told = f"fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}, size {camera.size}, {camera.lens} {camera.distortion}"
+    text = f"fx {fx:.1f} fy {fy:.1f} cx {cx:.1f} cy {cy:.1f}, size {camera.size}, {camera.lens} {camera.distortion}"
     width, height = SIZE if camera.size is None else camera.size
     y, x = np.mgrid[:height, :width]
     mask = np.hypot(x - width / 2, y - height / 2) < 60
     frame(np.full((height, width, 3), 0.5), np.full((height, width), 0.9), mask, camera, depth_scale=1.0)
-    return told
+    return text
 
 
 def _mask(path: Path) -> str:
     mask = read_mask(path)
     y, x = np.nonzero(mask)
-    told = f"{mask.sum()} pixels" + (f" of x {x.min()}–{x.max()}, y {y.min()}–{y.max()}" if mask.any() else "")
+    text = f"{mask.sum()} pixels" + (f" of x {x.min()}–{x.max()}, y {y.min()}–{y.max()}" if mask.any() else "")
     height, width = mask.shape
     frame(np.full((height, width, 3), 0.5), np.full((height, width), 0.9), mask, K)
-    return told
+    return text
 
 
 def _depth(path: Path) -> str:

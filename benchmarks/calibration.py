@@ -37,8 +37,8 @@ def read(paths: list[Path]) -> list[dict]:
     """The lines of objects made in code, in the order in which they were written."""
     rows = [parse_json(line) for path in paths for line in read_lines(path)]
     rows = [row for row in rows if "agreement" in row and " obj_" not in row["key"][1]]
-    if any(len(row["agreement"]) != PARTS for row in rows):
-        raise SystemExit("some lines are of another version, which told other parts: run benchmarks.photo_pairs again")
+    if any(len(row["agreement"]) != PARTS or "squared_mahalanobis" not in row for row in rows):
+        raise SystemExit("some lines are of an earlier version: run benchmarks.photo_pairs again")
     if not rows:
         raise SystemExit("no line is of an object made in code with an agreement: run benchmarks.photo_pairs synthetic")
     return rows
@@ -52,16 +52,16 @@ def split(rows: list[dict]) -> tuple[list[dict], list[dict]]:
 
 
 def cases(rows: list[dict], *, drawn: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What the regression sees [n 7], whether the pose is right [n], and whether the object was there at all [n]."""
-    seen = [(row["agreement"], row["add"] < RIGHT, True) for row in rows]
-    seen += [(row["absent"]["agreement"], False, False) for row in rows if "agreement" in row.get("absent", {})]
-    parts = np.array([agreement for agreement, _, _ in seen])
+    """The features of the regression [n 7], whether the pose is right [n], and whether the object was present [n]."""
+    found = [(row["agreement"], row["add"] < RIGHT, True) for row in rows]
+    found += [(row["absent"]["agreement"], False, False) for row in rows if "agreement" in row.get("absent", {})]
+    parts = np.array([agreement for agreement, _, _ in found])
     logs = np.log(np.clip(parts[:, :3], 1e-3, 1))
     others = parts[:, 3:].copy()
     if not drawn:
         logs[:, 2] = others[:, 0] = 0
     features = np.concatenate([np.ones((len(parts), 1)), logs, others], axis=1)
-    return features, np.array([right for _, right, _ in seen]), np.array([there for _, _, there in seen])
+    return features, np.array([right for _, right, _ in found]), np.array([present for _, _, present in found])
 
 
 # More agreement must not lower a confidence, nor a better rival raise it, however few cases say otherwise.
@@ -76,9 +76,9 @@ def fit_logistic(
     sign = np.where(right, -1.0, 1.0)
 
     def cost(weights):
-        odds = np.clip(sign * (features @ weights), -500, 500)
-        slope = features.T @ (sign / (1 + np.exp(-odds))) + shrink * weights
-        return np.logaddexp(0, odds).sum() + 0.5 * (shrink * weights**2).sum(), slope
+        logits = np.clip(sign * (features @ weights), -500, 500)
+        slope = features.T @ (sign / (1 + np.exp(-logits))) + shrink * weights
+        return np.logaddexp(0, logits).sum() + 0.5 * (shrink * weights**2).sum(), slope
 
     free = {0: (None, None), 1: (0, None), -1: (None, 0)}
     bounds = [free[int(s)] for s in (signs if signs is not None else [0] * features.shape[1])]
@@ -90,9 +90,9 @@ RIDGES = (0.03, 0.1, 0.3, 1.0, 3.0)
 
 
 def choose_ridge(rows: list[dict], *, drawn: bool = True) -> float:
-    """The shrinkage that tells most of each object from the others."""
+    """The shrinkage of the least log loss, each object predicted from the others."""
 
-    def surprise(ridge: float) -> float:
+    def log_loss(ridge: float) -> float:
         total = 0.0
         for name in sorted({row["key"][1] for row in rows}):
             others = cases([row for row in rows if row["key"][1] != name], drawn=drawn)
@@ -101,7 +101,7 @@ def choose_ridge(rows: list[dict], *, drawn: bool = True) -> float:
             total -= np.log(np.maximum(np.where(right, chance, 1 - chance), 1e-9)).sum()
         return total
 
-    return min(RIDGES, key=surprise)
+    return min(RIDGES, key=log_loss)
 
 
 def chances(features: np.ndarray, weights) -> np.ndarray:
@@ -117,12 +117,12 @@ def reliability(chance: np.ndarray, right: np.ndarray, bins: int = 10) -> tuple[
     return sum(abs(said - was) * count for said, was, count in rows) / len(chance), rows
 
 
-def surprises(rows: list[dict], config: ConfidenceConfig) -> tuple[np.ndarray, np.ndarray]:
+def mahalanobis_lengths(rows: list[dict], config: ConfidenceConfig) -> tuple[np.ndarray, np.ndarray]:
     """Squared Mahalanobis lengths of right poses, and their errors of scale in standard deviations (free scales)."""
     good = [row for row in rows if row["add"] < RIGHT]
     factor = [config.independent / row["independent"] for row in good]
-    squared = np.array([row["surprise"] * f for row, f in zip(good, factor, strict=True)])
-    free = [row["scale_surprise"] * f**0.5 for row, f in zip(good, factor, strict=True) if row["scale_free"]]
+    squared = np.array([row["squared_mahalanobis"] * f for row, f in zip(good, factor, strict=True)])
+    free = [row["scale_deviations"] * f**0.5 for row, f in zip(good, factor, strict=True) if row["scale_free"]]
     return squared, np.array(free)
 
 
@@ -135,12 +135,12 @@ def main() -> None:
     rows = read(options.results)
     fit, held = split(rows)
     now = ConfidenceConfig()
-    told = lambda weights: "(" + ", ".join(f"{w:.2f}" for w in weights) + ")"
+    as_text = lambda weights: "(" + ", ".join(f"{w:.2f}" for w in weights) + ")"
     print(f"best for the {len({r['key'][1] for r in fit})} objects to fit:")
     for name, drawn in (("drawn", True), ("undrawn", False)):
         ridge = choose_ridge(fit, drawn=drawn)
-        print(f"  {name} = {told(fit_logistic(*cases(fit, drawn=drawn)[:2], ridge, SIGNS))}, shrunk by {ridge:g}")
-    squared, _ = surprises(fit, now)
+        print(f"  {name} = {as_text(fit_logistic(*cases(fit, drawn=drawn)[:2], ridge, SIGNS))}, shrunk by {ridge:g}")
+    squared, _ = mahalanobis_lengths(fit, now)
     # By the 90 % ellipsoid: errors have longer tails than a Gaussian, and the tails are what a covariance is asked for.
     factor = stats.chi2.ppf(0.9, 6) / max(float(np.quantile(squared, 0.9)), 1e-9)
     print(f"  independent = {now.independent * factor:.3g}, pair_share = {now.pair_share * factor:.3g}\n")
@@ -155,10 +155,10 @@ def main() -> None:
 
 def page(held: list[dict], config: ConfidenceConfig) -> tuple[str, list[tuple[float, float, int]]]:
     """The held-out figures in Markdown, and the reliability rows."""
-    features, right, there = cases(held)
+    features, right, present = cases(held)
     chance = chances(features, config.drawn)
     error, rows = reliability(chance, right)
-    squared, scales = surprises(held, config)
+    squared, scales = mahalanobis_lengths(held, config)
     objects = len({row["key"][1] for row in held})
     known = ", ".join(words for method, words in SOURCES.items() if any(row["key"][0] == method for row in held))
     share = lambda chosen: f"{np.mean(chance[chosen] >= config.least):.1%}"
@@ -168,17 +168,17 @@ def page(held: list[dict], config: ConfidenceConfig) -> tuple[str, list[tuple[fl
         "",
         f"Made by `python -m benchmarks.calibration`, commit {commit()}, from searches by commit {states(held)}: "
         f"{objects} objects made in code "
-        f"that fitted nothing, known from {known}; {there.sum()} "
-        f"searches where the object was and {(~there).sum()} behind another object's mask. A pose is right if surface "
+        f"that fitted nothing, known from {known}; {present.sum()} searches where the object was "
+        f"and {(~present).sum()} behind another object's mask. A pose is right if surface "
         f"points are off by less than a tenth of the diameter on average (ADD).",
         "",
         "| what | figure |",
         "|---|---|",
-        f"| right among poses of objects that were there | {right[there].mean():.0%} |",
+        f"| right among poses of objects that were there | {right[present].mean():.0%} |",
         f"| expected calibration error, ten bins | {error:.3f} |",
-        f"| absent objects reported as present (confidence ≥ {config.least:g}) | {share(~there)} |",
+        f"| absent objects reported as present (confidence ≥ {config.least:g}) | {share(~present)} |",
         f"| right poses reported as present | {share(right)} |",
-        f"| wrong poses of present objects reported as present | {share(there & ~right)} |",
+        f"| wrong poses of present objects reported as present | {share(present & ~right)} |",
         f"| right poses inside the covariance's 90 % ellipsoid | {inside:.0%} of {len(squared)} |",
     ]
     if len(scales):

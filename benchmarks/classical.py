@@ -61,7 +61,7 @@ class Body:
 def import_open3d() -> Any:
     """Open3D on one thread; SystemExit with what to install where it is not there.
 
-    Its RANSAC stops when the threads have found enough: with several of them the answer hangs on which came first. It
+    Its RANSAC stops when the threads have found enough: with several of them the answer depends on which came first. It
     reads the number once, when it is loaded.
     """
     if "open3d" in sys.modules:

@@ -1,7 +1,7 @@
-"""``python -m benchmarks.gradients``: derivatives of pose, size and confidence beside differences of whole solutions.
+"""``python -m benchmarks.gradients``: derivatives of pose, size and confidence against differences of whole solutions.
 
 The cost of refinement has steps wherever a point changes what it is compared with, and its minima lie against them. So
-differences over tiny changes tell of steps alone. Here each difference is the slope of a parabola through solutions at
+differences over tiny changes measure the steps. Here each difference is the slope of a parabola through solutions at
 many changes, with its standard error; everything in float64.
 """
 
@@ -54,7 +54,7 @@ def change(name, amount, templates, query):
 CHANGES = {"depth": 0.01, "depth, waves": 0.01, "features": 0.02, "surface, size": 0.02, "surface, waves": 0.01}
 
 
-def tell(amounts, templates, query, start):
+def relative_estimate(amounts, templates, query, start):
     """Where the estimate is after changes, relative to ``start``: diameters, logarithm, rad; and its confidence."""
     for name, amount in zip(CHANGES, amounts, strict=True):
         templates, query = change(name, amount, templates, query)
@@ -66,12 +66,14 @@ def tell(amounts, templates, query, start):
 
 @jax.jit
 def differentiate(amounts, direction, templates, query, start):
-    """What :func:`tell` says, its derivative, and the pose itself."""
-    return jax.jvp(lambda amounts: tell(amounts, templates, query, start), (amounts,), (direction,), has_aux=True)
+    """:func:`relative_estimate`, its derivative, and the pose itself."""
+    return jax.jvp(
+        lambda amounts: relative_estimate(amounts, templates, query, start), (amounts,), (direction,), has_aux=True
+    )
 
 
 def rows(seed: int, count: int):
-    """For each kind of change: the derivative of everything told, the differences', and their standard errors."""
+    """For each kind of change: the derivative of each output, the differences', and their standard errors."""
     templates, (query, truth) = problems.make_templates(), problems.make_query(seed, noise=0.3)
     dense = eqx.tree_at(lambda t: t.surface, templates, problems.make_surface(2048))
     templates, query, truth = widen((dense, query, truth))

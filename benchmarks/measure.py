@@ -1,4 +1,4 @@
-"""Timing: everything of a row compiled first, then run in turns, so that a busy moment hits all alike."""
+"""Timing: all functions of a row are compiled first, then run in turns, so that other load affects them alike."""
 
 import os
 import platform

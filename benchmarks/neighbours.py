@@ -23,7 +23,7 @@ SIZES = [
 ]
 ROUNDED = {(50, 576), (25, 900)}  # views and patches at which a bf16 product's indices are compared too
 QUICK = [(20, 256, 384, "float32"), (5, 576, 384, "float32"), (5, 900, 384, "float32")]
-BASELINES = [(25, 256, 384), (400, 256, 384), (50, 576, 384), (25, 900, 384)]  # beside NumPy
+BASELINES = [(25, 256, 384), (400, 256, 384), (50, 576, 384), (25, 900, 384)]  # compared with NumPy
 REST = 0.1  # seconds between the calls of two libraries, each with threads of its own
 ACCELERATOR = [
     (400, 256, 384, "bfloat16"),
@@ -41,14 +41,14 @@ def rows(quick: bool):
 
 
 def baseline_rows(quick: bool):
-    """The kernel beside what a reader would write first, each with the machine to itself."""
+    """The kernel against the obvious forms in NumPy, each with the machine to itself."""
     for size in [(5, 256, 384)] if quick else BASELINES:
         yield from baselines(*size, repeats=3 if quick else 9)
     yield from loops(*(QUICK if quick else BASELINES)[0][:3], repeats=3 if quick else 7)
 
 
 def measure(views, patches, channels, dtype, repeats):
-    """The kernel's forms beside the bare product, and the disagreement of a bf16 product."""
+    """The kernel's forms against the bare product, and the disagreement of a bf16 product."""
     arguments = problem(views, patches, channels)
     on_cpu = jax.default_backend() == "cpu"
     forms = {

@@ -66,7 +66,7 @@ class Group:
     model: Any  # ipjax.bop.scoring.errors.Model
     reference: Shot
     queries: list[Shot]
-    made: bool = True  # tried with the true mesh, too
+    synthetic: bool = True  # an object made in code: also tried with the true mesh and with degraded copies
 
 
 def rigid(rotation: np.ndarray, translation: np.ndarray) -> Similarity[np.ndarray]:
@@ -136,8 +136,8 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
     none = Similarity(np.eye(3)[None], np.zeros((1, 3)), np.ones(1))
     for turn in range(-(-pairs // each)):
         rng = np.random.default_rng([seed, turn])
-        made = not (scans and turn % 2)
-        if not made:
+        synthetic = not (scans and turn % 2)
+        if not synthetic:
             name, mesh = scans[turn // 2 % len(scans)]
         else:
             kind = KINDS[turn // 2 % len(KINDS)] if scans else KINDS[turn % len(KINDS)]
@@ -151,11 +151,11 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
             if scene.masks[0].sum() < 400:
                 continue
             pose = scene.camera_from_object[0]
-            mask, beside = scene.masks
+            mask, other_mask = scene.masks
             truth = rigid(pose.rotation, pose.translation)
             shot = Shot(f"scene {k}", scene.rgb, scene.depth, mask, scene.matrix, truth)
-            told = made and k < ABSENT and beside.sum() >= 400
-            queries.append(dataclasses.replace(shot, other=beside if told else None))
+            search_other = synthetic and k < ABSENT and other_mask.sum() >= 400
+            queries.append(dataclasses.replace(shot, other=other_mask if search_other else None))
         if not queries:
             continue
         # One reference for several queries: its angle to the first is drawn, those to the others come of themselves.
@@ -178,7 +178,7 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
         points = mesh.vertices[np.unique(mesh.faces)] * size
         chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
         model = Model(points[chosen], size, none)
-        yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries, made)
+        yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries, synthetic)
 
 
 # --- measuring --------------------------------------------------------------------------------------------------------
@@ -216,11 +216,11 @@ def run(
             left = len(group.queries) if limit is None else min(limit - tried, len(group.queries))
             queries = group.queries[: max(left, 0)]
             if method not in ("rgb", "rgbd"):
-                queries = queries[: SCANS if group.made else 0]
+                queries = queries[: SCANS if group.synthetic else 0]
             keys = [(method, group.object, group.reference.name, query.name) for query in queries]
             if all(key in done for key in keys):
                 continue
-            start, trouble = time.perf_counter(), ""
+            start, failure = time.perf_counter(), ""
             ref = group.reference
             lens = Camera.from_matrix(ref.K)
             made, back = None, None
@@ -249,7 +249,7 @@ def run(
                     )
                     made = photo.templates, photo.info
             except ValueError as error:
-                trouble = str(error)
+                failure = str(error)
             onboarding = time.perf_counter() - start
             # One estimator for all: it compiles once for each shape of templates.
             everything.objects = [] if made is None else [made]
@@ -258,15 +258,15 @@ def run(
                 if key in done:
                     continue
                 start = time.perf_counter()
-                row = {"key": key, "angle": view_angle(ref, query), "trouble": trouble, "commit": state}
+                row = {"key": key, "angle": view_angle(ref, query), "failure": failure, "commit": state}
                 if estimator is not None:
                     row |= judge(group, method, estimator, query, back)
                 row |= {"onboard_s": onboarding, "estimate_s": time.perf_counter() - start}
                 if estimator is not None and query.other is not None:
-                    row["absent"] = look_elsewhere(estimator, query)
+                    row["absent"] = search_absent(estimator, query)
                 append_json(output, row)
-                told = f"ADD-S {row['add_s']:.3f}, {row['rotation']:.0f}°" if "add_s" in row else row["trouble"]
-                print(f"{' '.join(key)} at {row['angle']:.0f}°: {told}", flush=True)
+                text = f"ADD-S {row['add_s']:.3f}, {row['rotation']:.0f}°" if "add_s" in row else row["failure"]
+                print(f"{' '.join(key)} at {row['angle']:.0f}°: {text}", flush=True)
         tried += len(group.queries)
         if limit is not None and tried >= limit:
             return
@@ -287,11 +287,11 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
     try:
         crop = estimator.frame(0, query.rgb, query.depth, query.mask, query.K)
     except ValueError as error:
-        return {"trouble": str(error)}
+        return {"failure": str(error)}
     result = estimator.run(0, *crop, diameter=info.measured_diameter)
     estimate = result.estimate
     if not bool(estimate.success):
-        return {"trouble": "no pose found"}
+        return {"failure": "no pose found"}
 
     found = estimate.camera_from_object
     if method in ("scan", *DEGRADED):
@@ -323,10 +323,12 @@ def judge(group: Group, method: str, estimator, query: Shot, back: Any = None) -
         "mssd_recall": float(np.mean(mssd < steps)),
         "mspd_recall": float(np.mean(mspd < 100 * steps)),
         **certainty(estimate),
-        "surprise": surprise(pose.rotation @ true.rotation.T, moved, np.asarray(estimate.covariance, np.float64)),
+        "squared_mahalanobis": squared_mahalanobis(
+            pose.rotation @ true.rotation.T, moved, np.asarray(estimate.covariance, np.float64)
+        ),
         "independent": float(estimator.config.confidence.independent),
         "scale_free": info.measured_diameter is None,
-        "scale_surprise": float((scale - 1) * found.scale / scale / max(float(estimate.scale_std), 1e-9)),
+        "scale_deviations": float((scale - 1) * found.scale / scale / max(float(estimate.scale_std), 1e-9)),
     }
 
 
@@ -337,7 +339,7 @@ def camera_from_true_mesh(camera_from_object: Similarity, info, back: Any = None
 
 
 def certainty(estimate) -> dict:
-    """What an estimate says of itself."""
+    """Confidence, agreement and ambiguity of an estimate."""
     parts = [getattr(estimate.agreement, part.name) for part in dataclasses.fields(estimate.agreement)]
     return {
         "confidence": float(estimate.confidence),
@@ -346,22 +348,22 @@ def certainty(estimate) -> dict:
     }
 
 
-def surprise(turn: np.ndarray, moved: np.ndarray, covariance: np.ndarray) -> float:
-    """The squared Mahalanobis length of an error in rotation and translation: six on average if all is right."""
+def squared_mahalanobis(turn: np.ndarray, moved: np.ndarray, covariance: np.ndarray) -> float:
+    """The squared Mahalanobis length of an error in rotation and translation; 6 on average if that is right."""
     from scipy.spatial.transform import Rotation
 
     error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), moved])
     return float(error @ np.linalg.solve(covariance, error))
 
 
-def look_elsewhere(estimator, query: Shot) -> dict:
-    """The same search behind another object's mask."""
+def search_absent(estimator, query: Shot) -> dict:
+    """Search behind another object's mask, where the object is absent; the certainty of that estimate."""
     try:
         crop = estimator.frame(0, query.rgb, query.depth, query.other, query.K)
     except ValueError as error:
-        return {"trouble": str(error)}
+        return {"failure": str(error)}
     result = estimator.run(0, *crop, diameter=estimator.objects[0][1].measured_diameter)
-    return certainty(result.estimate) if bool(result.estimate.success) else {"trouble": "no pose found"}
+    return certainty(result.estimate) if bool(result.estimate.success) else {"failure": "no pose found"}
 
 
 def table(rows: list[dict]) -> str:

@@ -20,19 +20,19 @@ from ipjax.networks.dinov2 import DinoV2, DinoV2Config, Encoder, find_preset
 from ipjax.records import Query
 from ipjax.synthetic import problems
 
-BLOCK = 8  # whose features are the default
+BLOCK = 8  # of the encoder whose features are used
 PRESET = "vits14"
 
 
-class Both(eqx.Module):
-    """The tests' encoder at the cost of DINOv2."""
+class StandInWithDinov2(eqx.Module):
+    """The tests' encoder, with the cost of DINOv2: its features are computed and added with a weight of 1e-12."""
 
-    known: problems.CoordinateEncoder
-    paid: Encoder
+    stand_in: problems.CoordinateEncoder
+    dinov2: Encoder
 
     def __call__(self, image):
-        features = self.known(image)
-        return features + 1e-12 * self.paid(image)[..., : features.shape[-1]]
+        features = self.stand_in(image)
+        return features + 1e-12 * self.dinov2(image)[..., : features.shape[-1]]
 
 
 def rows(quick: bool):
@@ -58,7 +58,7 @@ def rows(quick: bool):
     for name, config, dtype, size in forms:
         shape = dataclasses.replace(tiny, dtype=dtype) if quick else find_preset(PRESET, dtype)
         model = DinoV2(shape, rngs=nnx.Rngs(0))
-        encoder = Both(problems.make_encoder(channels), Encoder(model, min(BLOCK, shape.depth - 1)))
+        encoder = StandInWithDinov2(problems.make_encoder(channels), Encoder(model, min(BLOCK, shape.depth - 1)))
         arguments = encoder, templates, query.view, key, config, size
         print(f"  compiling: {name}, {dtype}", flush=True)
         function, compile_s, temporary = compile_fresh(whole, *arguments)
@@ -78,6 +78,6 @@ def rows(quick: bool):
 
 
 def whole(encoder, templates, view, key, config, diameter):
-    """What is measured."""
+    """Describe a crop and estimate: the function that is measured."""
     query = Query(describe(encoder, view), view)
     return estimate(encoder, templates, query, key, config, diameter)

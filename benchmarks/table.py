@@ -1,6 +1,6 @@
-"""``python -m benchmarks.table results.json … [--into README.md]``: results as Markdown, by hand never.
+"""``python -m benchmarks.table results.json … [--into README.md]``: results as Markdown.
 
-Every row is written beside each results file (``results.md``). With ``--into`` the most telling ones replace the text
+All rows are written next to each results file (``results.md``). With ``--into`` the main ones replace the text
 between ``<!-- benchmarks -->`` and ``<!-- /benchmarks -->`` of that file.
 """
 
@@ -32,8 +32,8 @@ SHORT = ("what", "how", "size", "median", "compile", "temporary", "ratio")
 SIZES = ("400 × 256² × 384", "50 × 576² × 384", "25 × 900² × 384")
 
 
-def is_telling(row: dict) -> bool:
-    """Of the neighbours only the kernel, its product and the plain form, at three sizes in float32."""
+def is_headline(row: dict) -> bool:
+    """Whether a row is a main one; of "neighbours" only the kernel, its product and einsum, float32, at three sizes."""
     if row["name"] != "neighbours":
         return True
     plain = row["implementation"] in ("product, view by view", "nearest (xla)", "einsum + argmax")
@@ -41,10 +41,10 @@ def is_telling(row: dict) -> bool:
 
 
 def render(results: dict, short: bool = False) -> str:
-    """One device's results as a heading and a table, of all rows or the most telling ones; ``results["stale"]`` says
+    """One device's results as a heading and a table, of all rows or the main ones; ``results["stale"]`` says
     what has changed since, where something has."""
     columns = {name: cell for name, cell in COLUMNS.items() if not short or name in SHORT}
-    rows = [row for row in results["rows"] if not short or is_telling(row)]
+    rows = [row for row in results["rows"] if not short or is_headline(row)]
     lines = [
         f"**{results['device']}** ({results['platform']}, {results['cores']} cores), jax {results['jax']}, "
         f"Python {results['python']}, {results['date']}, commit {results.get('commit', 'unknown')}"

@@ -53,8 +53,8 @@ def pictures(study: Study, side: int = 260) -> list[tuple[str, str]]:
             outline, _ = cv2.findContours(enlarged.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
             cv2.drawContours(photo, outline, -1, colour, 3 if colour[0] < 100 else 1, cv2.LINE_AA)
         grey = (0.35 * frame.rgb.mean(-1, keepdims=True) + 120).astype(np.uint8)
-        beside = np.where(model.any(-1, keepdims=True), model, np.repeat(grey, 3, axis=-1))
-        both = np.concatenate([photo, resize(cut(beside, box), side)], axis=1)
+        rendered = np.where(model.any(-1, keepdims=True), model, np.repeat(grey, 3, axis=-1))
+        both = np.concatenate([photo, resize(cut(rendered, box), side)], axis=1)
         off = f"{100 * error(one):.0f} % of the diameter" if math.isfinite(error(one)) else "more than a diameter"
         caption = (
             f"{kind}: scene {place[0]}, image {place[1]}, object {place[2]}; MSSD {off}, rotation "

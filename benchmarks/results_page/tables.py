@@ -22,7 +22,7 @@ def overview(studies: list[Study]) -> list[list[str]]:
 
 
 def median_cells(run: dict) -> list[str]:
-    """Rotation, translation, scale; the last is no error of a method that was told it."""
+    """Rotation, translation, scale; the last is no error of a method that was given the size."""
     m = run["medians"]
     cells = [f"{m[k]:.1f}" if k in m else "–" for k in ("rotation_deg", "translation_mm", "scale_percent")]
     return [*cells[:2], "given" if knows_size(run) else cells[2]]
@@ -108,9 +108,9 @@ def preamble(studies: list[Study]) -> list[str]:
 
 
 def notes(study: Study) -> list[str]:
-    """What the runs have to say of themselves, once each."""
-    told = [note for run in study.runs for note in run["notes"] if "true size" not in note]
-    return [f"{note}." for note in dict.fromkeys(told)]
+    """The notes of all runs, once each."""
+    chosen = [note for run in study.runs for note in run["notes"] if "true size" not in note]
+    return [f"{note}." for note in dict.fromkeys(chosen)]
 
 
 def percent(value: float | None, interval=None) -> str:

@@ -19,8 +19,8 @@ from ipjax.networks.dinov2 import Encoder
 from ipjax.records import Patches, View
 from ipjax.transforms import Similarity
 
-SHARED = 512  # descriptions kept for a second configuration; about 1.5 MB each
-# What an estimate depends on in this package: what is read, and how an answer becomes a row.
+SHARED = 512  # described crops kept for other configurations; about 1.5 MB each
+# The modules of this package that an estimate depends on: reading, and writing an estimate as a row.
 READERS = ("alignments", "dataset", "detections", "estimator", "masks", "objects", "records", "results")
 
 
@@ -92,7 +92,7 @@ class DatasetEstimator:
 
     @property
     def aligned_by(self) -> dict[int, str]:
-        """Where each comes from, likewise."""
+        """Where each alignment comes from, for `evaluation.evaluate`."""
         return {obj_id: self.objects[obj_id].aligned_by for obj_id in self.alignments}
 
     def settings(self) -> dict[str, Any]:
@@ -104,7 +104,7 @@ class DatasetEstimator:
                 "content": info.content_sha256,
                 "mesh": info.mesh_sha256,
                 "notes": list(info.notes),
-                **_plain(info.config),
+                **_onboarding_settings(info.config),
             }
         return {
             "version": __version__,
@@ -136,7 +136,7 @@ class DatasetEstimator:
                 else:
                     crop, patches, seconds = kept
                     self.shared_seconds += seconds
-            except ValueError as error:  # nothing to be seen there: a miss
+            except ValueError as error:  # the mask or the depth is empty: a miss
                 self.refused.append(f"{where}: {error}")
                 continue
             seconds = time.perf_counter() - start
@@ -168,5 +168,6 @@ class DatasetEstimator:
         return self.order[obj_id]
 
 
-def _plain(config: Any) -> dict[str, Any]:
+def _onboarding_settings(config: Any) -> dict[str, Any]:
+    """How an object was onboarded, as plain JSON; empty where that is not known."""
     return {"onboarding": json.loads(json.dumps(config, default=str))} if config else {}

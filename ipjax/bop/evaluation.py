@@ -1,4 +1,4 @@
-"""Running an estimator over a data set so that it can be resumed, and scoring what it found."""
+"""Running an estimator over a data set, resumably, and scoring its estimates."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,7 +19,7 @@ from ipjax.files.storage.writing import write_text
 from ipjax.progress import bar
 from ipjax.transforms import Similarity
 
-LISTED = 20  # images that failed and are told with their reason
+LISTED = 20  # failed images that are listed with their reasons
 Estimator = Callable[[Frame, list[Target]], list[Estimate]]
 
 
@@ -147,6 +147,7 @@ def evaluate(
 
 
 def _uncounted(estimator: Any) -> float:
+    """Seconds of an estimator that are not part of the time per image, less those to be added to it."""
     return getattr(estimator, "compile_seconds", 0.0) - getattr(estimator, "shared_seconds", 0.0)
 
 

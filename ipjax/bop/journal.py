@@ -53,7 +53,7 @@ class Journal:
         self.done[image] = Done(rows, seconds, error)
 
     def _read(self, lines: list[str], head: Mapping[str, Any]) -> bool:
-        """Take over what was done; False where it was made otherwise and is to be forgotten."""
+        """Take over the finished images; False where other settings made them and a restart is allowed."""
         differs: list[str] = []
         for number, line in enumerate(lines, start=1):
             try:

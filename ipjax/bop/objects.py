@@ -83,13 +83,13 @@ def prepare_objects(
     for obj_id in sorted({*meshes, *alignments}):
         if (obj_id in meshes) != (obj_id in alignments):
             raise DatasetError(f"object {obj_id}: a mesh of one's own and an alignment file come together")
-    there: dict[int, Path] = {}
+    existing: dict[int, Path] = {}
     if folder is not None:
         folder = Path(folder) / f"quality_{quality}" if quality else Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         for path in sorted(folder.glob("*.ipjax")):
             if number := re.search(r"(\d+)$", path.stem):
-                there[int(number[1])] = path
+                existing[int(number[1])] = path
     found = {}
     for count, obj_id in enumerate(sorted(wanted)):
         source = Path(meshes[obj_id]) if obj_id in meshes else dataset.model_path(obj_id, "models")
@@ -100,7 +100,7 @@ def prepare_objects(
         elif folder is None:
             path = cache_folder("objects") / f"{source.stem}_{key}.ipjax"
         else:
-            path = there.get(obj_id, folder / f"obj_{obj_id:06d}.ipjax")
+            path = existing.get(obj_id, folder / f"obj_{obj_id:06d}.ipjax")
         if quality and alignment is None:
             alignment = _read_kept(path.with_suffix(".json"))
         if not path.is_file() or (quality and alignment is None):
@@ -138,7 +138,7 @@ def hash_origin(
     seed: int,
     hash_code: Callable[..., str] = hash_executed,
 ) -> str:
-    """All that an object file is made of, the code included, in sixteen digits."""
+    """A hash (16 digits) of everything that an object file depends on: mesh, encoder, settings and code."""
     parts = [
         __version__,
         FORMAT,
@@ -171,7 +171,7 @@ def _onboard(
         raise DatasetError(f"{source}: a mesh of one's own is not degraded further")
     mesh, back = degrade(load_mesh(source), quality, seed)
     templates, info = onboard(mesh, encoder, config, name=source.stem, progress=progress)
-    # Its map back is written first: an object file without one would be of no use.
+    # The alignment is written first: an object file without one could not be scored.
     write_text(path.with_suffix(".json"), json.dumps(alignment_as_json(back)))
     save(path, templates, dataclasses.replace(info, mesh_file=source.name))
     return _read_kept(path.with_suffix(".json"))
@@ -182,7 +182,7 @@ def _read_kept(path: Path) -> Similarity[np.ndarray] | None:
 
 
 def _list_files(source: Path) -> list[Path]:
-    """A mesh file and the files beside it that it or its materials name, or that share its name."""
+    """A mesh file and the files in its folder that it or its materials name, or that share its name."""
     around = [p for pattern in ("*", "*/*") for p in source.parent.glob(pattern) if p.suffix.lower() in MESH_FILES]
     found, waiting = {source}, [source]
     while waiting:

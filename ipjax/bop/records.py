@@ -94,7 +94,7 @@ class ModelInfo:
 
 
 def check_rotation(rotation: Sequence[float] | np.ndarray) -> None:
-    """Nothing where nine numbers are a rotation, row by row, up to rounding (official result files have determinants
+    """Check that nine numbers are a rotation, row by row, up to rounding (official result files have determinants
     within 0.003 of 1). Raises ValueError, in words, for what scales, mirrors or shears.
     """
     matrix = np.asarray(rotation, np.float64).reshape(3, 3)

@@ -104,7 +104,7 @@ def write_results(path: str | Path, rows: Iterable[ResultRow], *, scales: Sequen
 
 
 def sized_path(path: str | Path) -> Path:
-    """Where the sizes of a BOP result file are kept: beside it, as ``.sized``, which nobody takes for a BOP file."""
+    """Where the sizes of a BOP result file are kept: next to it, as ``.sized``, not to be taken for a BOP file."""
     return Path(path).with_suffix(".sized")
 
 

@@ -1,4 +1,4 @@
-"""How far points move from one pose to another, in space and in the image: what all errors of poses are made of."""
+"""How far points move from one pose to another, in space and in the image: the basis of all errors of poses."""
 
 from typing import Any
 

@@ -1,6 +1,6 @@
 """The parts of a pose's error: rotation, translation, size.
 
-Arrays are JAX's or NumPy's: what comes in says where, and in what precision, the work is done.
+Arrays are JAX's or NumPy's; the result is of the same kind and precision.
 """
 
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Which estimate gets which instance, and the precision of detections (thodan/bop_toolkit, pose_matching.py, score.py).
+"""Matching estimates to instances, and the precision of detections (thodan/bop_toolkit, pose_matching.py, score.py).
 
 On the host, in NumPy: what is matched depends on what has been matched before.
 """
@@ -15,7 +15,7 @@ def match_poses(
     threshold: float,
     valid: Bool[np.ndarray, "g"] | None = None,
 ) -> Int[np.ndarray, "e"]:
-    """Which ground truth [e] each estimate gets at a threshold, −1 = none: greedily by falling score, one to one, the
+    """The truth [e] that each estimate is matched to at a threshold, −1 = none: by falling score, one to one, the
     smallest error below the threshold (strictly) among valid truths that are still free (pose_matching.py:9-92)."""
     count, truths = pose_errors.shape
     matched = np.full(count, -1)

@@ -199,8 +199,8 @@ def sized_errors(
     truth: Similarity,
     estimate: Similarity,
 ) -> SizedErrors:
-    """What BOP's errors do not see: its files hold no size, so that its scores move the model rigidly, and a pose whose
-    size is wrong by a third is perfect. Here the estimate maps the model's points with its own scale.
+    """Errors of a pose with the model at its estimated size, which BOP's errors ignore: its files hold no size, and a
+    pose whose size is wrong by a third can be perfect. Here the estimate maps the model's points with its own scale.
 
     Args:
         diameter: of the points, in their unit; the truth's scale makes it the true diameter.

@@ -1,4 +1,4 @@
-"""VSD: what of an object is visible and lies where it should (Hodan et al., BOP Challenge 2020, section 2.2)."""
+"""VSD, the discrepancy of the visible surface (Hodan et al., BOP Challenge 2020, section 2.2)."""
 
 import jax
 import jax.numpy as jnp

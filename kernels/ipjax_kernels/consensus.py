@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ipjax_kernels.similarity import fit_batch_last
 
-_TOGETHER = 8  # pairs that are judged in one step on a CPU: more are not faster and take longer to compile
+_PAIRS_PER_STEP = 8  # pairs that are scored in one step on a CPU: more are not faster and take longer to compile
 
 
 class Hypotheses(NamedTuple):
@@ -117,15 +117,15 @@ def score_batch_last(
 
     def by_pairs(rotation, translation, scale, source, target, weight, threshold):
         # A CPU sums along the last axis one number at a time. Here a few pairs at a time are added to the sums of
-        # all hypotheses, which vectorises and stays in the cache; a score that nobody reads costs nothing.
+        # all hypotheses, which vectorises and stays in the cache; a score that is not used is not computed.
         total = jnp.sum(weight)
         share = weight / jnp.where(total > 0, total, 1)
         limit = jnp.square(threshold)
         inverse = 1 / jnp.where(limit > 0, limit, 1)
         scaled = jax.lax.optimization_barrier(scale * rotation)
-        padding = -weight.shape[0] % _TOGETHER
+        padding = -weight.shape[0] % _PAIRS_PER_STEP
         parts = [
-            jnp.pad(x, ((0, padding), *[(0, 0)] * (x.ndim - 1))).reshape(-1, _TOGETHER, *x.shape[1:])
+            jnp.pad(x, ((0, padding), *[(0, 0)] * (x.ndim - 1))).reshape(-1, _PAIRS_PER_STEP, *x.shape[1:])
             for x in (source, target, weight, share)
         ]
 
@@ -176,9 +176,8 @@ def consensus(
     """The ``keep`` similarities that most pairs agree on, best first.
 
     ``count`` minimal sets of ``size`` pairs are drawn in proportion to the weights (or given: ``sets``, indices
-    (n, m)), a similarity is fitted to each, and all pairs judge it. The best are fitted again to their inliers,
-    ``refits`` times, and keep the better of the two, so a score never falls
-    (by more than rounding).
+    (n, m)), a similarity is fitted to each and scored by all pairs. The best are fitted again to their inliers,
+    ``refits`` times, and the better of the two is kept, so that a score never falls (by more than rounding).
 
     ``threshold`` is the distance below which a pair is an inlier, in target units; with ``relative`` a fraction of the
     hypothesis's own scale (the object's diameter, if the source has unit diameter). ``rank``: "msac" = the truncated
@@ -210,7 +209,7 @@ def consensus(
     lower, upper = (jnp.asarray(bound, source.dtype) for bound in scale_bounds)
     threshold = jnp.asarray(threshold, source.dtype)
 
-    def rate(scores, scale, allowed):
+    def rank_scores(scores, scale, allowed):
         truncated, inside, loss = scores
         allowed = allowed & (scale >= lower) & (scale <= upper)
         first = truncated if rank == "msac" else inside
@@ -237,7 +236,7 @@ def consensus(
     with jax.named_scope("judge"):
         limit = limit_of(scale)
         scores = score_batch_last(rotation, translation, scale, source, target, weight, limit)
-        score, loss, success = rate(scores, scale, success)
+        score, loss, success = rank_scores(scores, scale, success)
         # A full sort costs six times as much; only "count" needs its second key.
         order = jax.lax.top_k(score, keep)[1] if rank == "msac" else _order(score, loss)[:keep]
         rotation, translation = jnp.moveaxis(rotation[..., order], -1, 0), jnp.moveaxis(translation[..., order], -1, 0)
@@ -251,7 +250,7 @@ def consensus(
         rotation, translation = jnp.moveaxis(fitted[0], -1, 0), jnp.moveaxis(fitted[1], -1, 0)
         squared, limit, inliers = judge(rotation, translation, fitted[2])
         scores = score_sets(squared, weight, limit)
-        new_score, new_loss, allowed = rate(scores, fitted[2], fitted[4] & success)
+        new_score, new_loss, allowed = rank_scores(scores, fitted[2], fitted[4] & success)
         # Sums of the same weights in another order may differ in the last digit; the loss decides then.
         tied = jnp.abs(new_score - score) <= 8 * jnp.finfo(score.dtype).eps
         better = allowed & jnp.where(tied, new_loss < loss, new_score > score)

@@ -13,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ipjax_kernels.positive import root
 
-_SHARES = (0.375, 0.5, 0.625, 0.75)  # of the query's patches: what its valid ones are cut to, if they fit
-_LEAST = 64  # patches; fewer are not worth the branches
+_SHARES = (0.375, 0.5, 0.625, 0.75)  # of the query's patches: sizes that its valid patches are compacted to
+_LEAST_PATCHES = 64  # patches; fewer are not worth the branches
 NO_MATCH = -2.0  # the similarity of a patch that has no neighbour: finite, and below every cosine
 
 
@@ -79,7 +79,7 @@ def nearest(
         if implementation == "pallas":
             if dtype != "bfloat16":
                 raise ValueError(f'implementation="pallas" multiplies bfloat16, not {dtype}: pass dtype="bfloat16"')
-            if _others_than_hopper():
+            if _has_other_gpu():
                 found = blocks(query, templates, query_valid, template_valid)
             else:
                 from ipjax_kernels.neighbours_mosaic import search  # Pallas is a heavy import that few need
@@ -119,11 +119,11 @@ def cycle_distance(
     return jnp.where(query_valid & template_valid[query_to_template], distance, jnp.inf)
 
 
-def _others_than_hopper():
-    """Whether a GPU is here for which the fused kernel was not written."""
+def _has_other_gpu():
+    """Whether this machine has a GPU other than Hopper, for which alone the fused kernel was written."""
     try:
         devices = jax.devices("cuda")
-    except RuntimeError:  # none at all: what is traced here may be lowered for elsewhere
+    except RuntimeError:  # no GPU: what is traced here may be exported to one
         return False
     return any(getattr(device, "compute_capability", "9.0") != "9.0" for device in devices)
 
@@ -151,7 +151,7 @@ def _search_blocks(query, templates, query_valid, template_valid, *, memory_byte
             templates = jax.lax.bitcast_convert_type(templates, jnp.uint16)
         patches = query.shape[0]
         arguments = query.astype(dtype), query_valid, templates, template_valid
-        if not compact or patches < _LEAST:
+        if not compact or patches < _LEAST_PATCHES:
             return _search_all(*arguments, memory_bytes=memory_bytes)
         sizes = sorted({min(patches, 16 * math.ceil(share * patches / 16)) for share in (*_SHARES, 1.0)})
         count = jnp.sum(query_valid, dtype=jnp.int32)
@@ -163,7 +163,7 @@ def _search_blocks(query, templates, query_valid, template_valid, *, memory_byte
 
 
 def _search_first(query, query_valid, templates, template_valid, *, size, memory_bytes):
-    """Search for ``size`` patches of the query, all valid ones among them, and number the results as if for all."""
+    """Search for ``size`` patches of the query, all valid ones among them; indices are those of the whole query."""
     patches = query.shape[0]
     if size == patches:
         return _search_all(query, query_valid, templates, template_valid, memory_bytes=memory_bytes)

@@ -51,8 +51,8 @@ def search(
         rows, columns = pl.ds(part * _ROWS, _ROWS), pl.ds(step * _COLUMNS, _COLUMNS)
 
         def product(accumulator):
-            def multiply(_, mine, theirs):
-                plgpu.wgmma(accumulator, mine, theirs)
+            def multiply(_, query_tile, template_tile):
+                plgpu.wgmma(accumulator, query_tile, template_tile)
                 plgpu.wgmma_wait(1)  # all but this one: its operands are released a step later
 
             plgpu.emit_pipeline(

@@ -128,11 +128,11 @@ def rasterize(
 
     offset = jnp.arange(tile, dtype=jnp.int32)
     offset_x, offset_y = jnp.tile(offset, tile), jnp.repeat(offset, tile)
-    nobody = jnp.asarray(faces.shape[0], jnp.int32)
+    no_face = jnp.asarray(faces.shape[0], jnp.int32)
     empty = (
         jnp.asarray(0, jnp.int32),
         jnp.full(height * width, jnp.asarray(0, screen.dtype)),  # inverse depth: the largest wins
-        jnp.full(height * width, nobody),
+        jnp.full(height * width, no_face),
     )
 
     def unfinished(state):
@@ -141,7 +141,7 @@ def rasterize(
     def draw(state):
         start, nearest, owner = state
         square = start + jnp.arange(block, dtype=jnp.int32)
-        face = jnp.minimum(jnp.searchsorted(ends, square, side="right"), nobody - 1).astype(jnp.int32)
+        face = jnp.minimum(jnp.searchsorted(ends, square, side="right"), no_face - 1).astype(jnp.int32)
         count = squares[face]
         rest = square - (ends[face] - count[:, 0] * count[:, 1])
         across = jnp.maximum(count[:, 0], 1)
@@ -154,7 +154,7 @@ def rasterize(
         place = jnp.where(hit, row * width + column, height * width).reshape(-1)
         value = value.reshape(-1)
         closer = nearest.at[place].max(value, mode="drop")
-        owner = jnp.where(closer > nearest, nobody, owner)  # beaten by this block
+        owner = jnp.where(closer > nearest, no_face, owner)  # beaten by this block
         wins = closer.at[place].get(mode="fill", fill_value=jnp.inf) == value
         index = jnp.broadcast_to(face[:, None], hit.shape).reshape(-1)
         owner = owner.at[jnp.where(wins, place, height * width)].min(index, mode="drop")
@@ -164,7 +164,7 @@ def rasterize(
         _, nearest, owner = empty
     else:
         _, nearest, owner = lax.while_loop(unfinished, draw, empty)
-    seen = owner < nobody
+    seen = owner < no_face
     face = jnp.where(seen, owner, 0)
     row, column = jnp.divmod(jnp.arange(height * width, dtype=jnp.int32), width)
     if faces.shape[0] == 0:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-# Rounding may turn the rotation by at most about 1 / _MARGIN radians before ``success`` denies it.
+# Rounding may turn the rotation by at most about 1 / _MARGIN radians before ``success`` is false.
 _MARGIN = 128.0
 # Up to so many points are summed one by one.
 _FEW = 8
@@ -155,8 +155,8 @@ def _polar_of_triangles(matrix, share, source, target):
     over, and the larger of the two traces wins: their sum and difference are the singular values.
     """
     del matrix  # only derivatives go through it
-    there = share > 0
-    corners = [[tuple(jnp.where(there[i], x[i], 0) for x in arm) for i in range(3)] for arm in (source, target)]
+    present = share > 0
+    corners = [[tuple(jnp.where(present[i], x[i], 0) for x in arm) for i in range(3)] for arm in (source, target)]
     (before, after) = _part(tuple(_span(list(corner)) for corner in corners))
     flat = [
         [(_dot(e1, arm), _dot(e2, arm)) for arm in corner]
@@ -165,23 +165,23 @@ def _polar_of_triangles(matrix, share, source, target):
     xx, xy, yx, yy = (
         _dot(share, [flat[1][i][row] * flat[0][i][column] for i in range(3)]) for row in (0, 1) for column in (0, 1)
     )
-    straight, over = (xx + yy, yx - xy), (xx - yy, yx + xy)
-    straight, over = _part((straight, over))
+    straight, flipped = (xx + yy, yx - xy), (xx - yy, yx + xy)
+    straight, flipped = _part((straight, flipped))
     # Computed once: of collinear points the two are equal up to rounding, and if each reader of the comparison had its
     # own rounding, cosine and sine could come from different ones.
-    straight_trace, over_trace = _part(tuple(jnp.sqrt(c * c + s * s) for c, s in (straight, over)))
-    turned = over_trace > straight_trace
-    trace = jnp.where(turned, over_trace, straight_trace)
+    straight_trace, flipped_trace = _part(tuple(jnp.sqrt(c * c + s * s) for c, s in (straight, flipped)))
+    turned = flipped_trace > straight_trace
+    trace = jnp.where(turned, flipped_trace, straight_trace)
     known = trace > 0
-    cosine = jnp.where(known, jnp.where(turned, over[0], straight[0]) / jnp.where(known, trace, 1), 1)
-    sine = jnp.where(known, jnp.where(turned, over[1], straight[1]) / jnp.where(known, trace, 1), 0)
+    cosine = jnp.where(known, jnp.where(turned, flipped[0], straight[0]) / jnp.where(known, trace, 1), 1)
+    sine = jnp.where(known, jnp.where(turned, flipped[1], straight[1]) / jnp.where(known, trace, 1), 0)
     sign = jnp.where(turned, -1, 1).astype(trace.dtype)
     cosine, sine, sign = _part((cosine, sine, sign))
     image_1 = tuple(cosine * a + sine * b for a, b in zip(*after, strict=True))
     image_2 = tuple(sign * (cosine * b - sine * a) for a, b in zip(*after, strict=True))
     image_1, image_2 = _part((image_1, image_2))
     rotation = _combine((image_1, image_2, _cross(image_1, image_2)), (*before, _cross(*before)))
-    first, second = 0.5 * (straight_trace + over_trace), 0.5 * jnp.abs(straight_trace - over_trace)
+    first, second = 0.5 * (straight_trace + flipped_trace), 0.5 * jnp.abs(straight_trace - flipped_trace)
     return rotation, trace, jnp.stack([first, second, jnp.zeros_like(first)])
 
 

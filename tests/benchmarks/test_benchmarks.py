@@ -177,14 +177,14 @@ def test_an_estimate_of_a_degraded_mesh_is_one_of_the_true_mesh():
     np.testing.assert_allclose(found.to_matrix(), truth.to_matrix(), atol=1e-9)
 
 
-def make_row(turn: int, right: bool, *, surprise: float = 6.0) -> dict:
+def make_row(turn: int, right: bool, *, squared: float = 6.0) -> dict:
     quality = 0.9 if right else 0.3
     return {
         "key": ["scan", f"{turn:04d} mug-{turn}", "photo", "scene 0"],
         "agreement": [quality, quality, quality, quality, 1.0, 0.2],
         "add": 0.02 if right else 0.5,
-        "surprise": surprise,
-        "scale_surprise": 0.5,
+        "squared_mahalanobis": squared,
+        "scale_deviations": 0.5,
         "scale_free": True,
         "independent": 1.0,
         "absent": {"agreement": [0.2, 0.1, 0.1, 0.0, 1.0, 0.9]},

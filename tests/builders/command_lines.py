@@ -1,4 +1,4 @@
-"""Command lines of ``ipjax`` that are right, to be spoiled, and how tests run them."""
+"""Valid command lines of ``ipjax``, for tests to change, and how tests run them."""
 
 import json
 from pathlib import Path

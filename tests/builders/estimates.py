@@ -1,4 +1,4 @@
-"""An estimate as a method that is sure of one pose would make it."""
+"""An estimate of a method that is certain of one pose."""
 
 import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""The packages of the house in their order, and every module with its place."""
+"""The packages in their order, and the place of every module in it."""
 
 from pathlib import Path
 

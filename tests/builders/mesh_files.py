@@ -1,4 +1,4 @@
-"""A box with six coloured sides, written by hand in every form of every format, and what is read of it."""
+"""A box with six coloured sides, written in every form of every format, and checks of what is read of it."""
 
 import io
 import json

@@ -1,4 +1,4 @@
-"""An onboarded object of random numbers, and object files changed behind the writer's back."""
+"""An onboarded object of random numbers, and object files with altered content."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -54,7 +54,7 @@ def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templ
 
 
 def rewrite(path, change=None, drop=None, metadata=None):
-    """The file with tensors and description changed, by its own honest writer: hostile, but well-formed."""
+    """Write an object file again with altered tensors or description: well-formed, but not as it was saved."""
     from safetensors import safe_open
     from safetensors.numpy import load_file, save_file
 

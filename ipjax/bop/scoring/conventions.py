@@ -1,4 +1,4 @@
-"""Result files that are in another unit, in other axes, or the wrong way round: they would score 0 without a hint."""
+"""Finding result files in another unit, in other axes, or of inverse poses, which would score 0 without a hint."""
 
 import math
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ def suspect_conventions(
     pairs: Sequence[tuple[Similarity[np.ndarray], Sequence[Similarity[np.ndarray]], np.ndarray]],
 ) -> str | None:
     """What is wrong with all of a file's poses, given each with those of the annotation and with the rotations of the
-    object's symmetries: in words, or None. Only what no method that merely fails can do: three quarters of the lengths
+    object's symmetries: in words, or None. It takes what no failing method would produce: three quarters of the lengths
     off by the factor of another unit; half of the rotations right when transposed, and hardly any as they are; three
     quarters of the objects behind the camera, at the right distance."""
     if not pairs:

@@ -27,12 +27,12 @@ def measure_precision(protocol: Protocol, rows: Sequence[ResultRow]) -> dict[str
         best = sorted(grouped.get((scene, image), []), key=lambda row: -row.score)[:DETECTIONS]
         for obj in objects:
             mine = [row for row in best if row.obj_id == obj]
-            there = [t for t in truths if t.obj_id == obj]
-            valid = np.array([t.visible < 0 or t.visible >= VISIBLE for t in there], bool)
+            annotated = [t for t in truths if t.obj_id == obj]
+            valid = np.array([t.visible < 0 or t.visible >= VISIBLE for t in annotated], bool)
             counts[obj] += int(valid.sum())
-            if mine and there:  # the toolkit drops estimates of objects that are not in the image at all
-                row = TargetRow(scene, image, obj, len(there))
-                targets[obj].append(ScoredTarget(row, camera, width, there, valid, mine))
+            if mine and annotated:  # the toolkit drops estimates of objects that are not in the image at all
+                row = TargetRow(scene, image, obj, len(annotated))
+                targets[obj].append(ScoredTarget(row, camera, width, annotated, valid, mine))
     table = {"mssd": [], "mspd": []}
     for obj in sorted(objects):
         if counts[obj] == 0:

@@ -46,7 +46,7 @@ class ScoredTarget:
 
 
 class Protocol:
-    """One scoring: what is asked for, what has been read, what went wrong."""
+    """One scoring of a result file: its targets, the data it has read, notes and problems."""
 
     def __init__(self, dataset, metrics, objects, delta, on_error, symmetric, progress, without=()):
         self.dataset, self.metrics, self.delta, self.on_error = dataset, metrics, delta, on_error

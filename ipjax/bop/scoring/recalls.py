@@ -69,7 +69,7 @@ def find_instances(targets: list[ScoredTarget]) -> list[Instance]:
     found = []
     for target in targets:
         scores = np.array([e.score for e in target.estimates])
-        table = np.where(np.isfinite(target.mssd), target.mssd, 1e9)  # far is bad, but it is an estimate
+        table = np.where(np.isfinite(target.mssd), target.mssd, 1e9)  # infinitely far is still an estimate
         matched = metrics.match_poses(table, scores, np.inf, target.valid) if len(scores) else np.zeros(0, int)
         owner = {int(g): e for e, g in enumerate(matched) if g >= 0}
         for g, truth in enumerate(target.truths):

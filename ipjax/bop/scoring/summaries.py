@@ -49,7 +49,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class Score:
-    """What a result file is worth on a data set."""
+    """The score of a result file on a data set."""
 
     dataset: str
     method: str

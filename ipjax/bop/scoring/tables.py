@@ -13,7 +13,7 @@ SIZED = {"mssd": "MSSD", "add_or_s": "ADD(-S)"} | {
 
 
 def format_score(found: Score) -> str:
-    """What a person wants to see of a score: recalls, medians, areas and a line for each object."""
+    """A score as a table for people: recalls, medians, areas under curves, and a line for each object."""
     names = [n for n in ("vsd", "mssd", "mspd", "ar") if n in found.all_frames.recalls]
     heads = {"vsd": "AR_VSD", "mssd": "AR_MSSD", "mspd": "AR_MSPD", "ar": "AR"}
     lines = [f"{found.method} on {found.dataset}", ""]
