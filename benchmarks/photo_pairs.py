@@ -349,7 +349,7 @@ def certainty(estimate) -> dict:
 
 
 def squared_mahalanobis(turn: np.ndarray, moved: np.ndarray, covariance: np.ndarray) -> float:
-    """The squared Mahalanobis length of an error in rotation and translation under a covariance; 6 on average if that holds."""
+    """The squared Mahalanobis length of an error in rotation and translation: 6 on average under a right covariance."""
     from scipy.spatial.transform import Rotation
 
     error = np.concatenate([Rotation.from_matrix(turn).as_rotvec(), moved])
