@@ -20,7 +20,7 @@ def align(
 
     Args:
       pairs: ``v k`` correspondences; weight 0 = absent.
-      size: the object's diameter as mask and depth suggest it, metres; centre of the scale gate.
+      size: an estimate of the object's diameter from mask and depth, metres; centre of the scale gate.
       diameter: the true diameter, metres, where it is known: then only rotation and translation are free.
 
     Returns:
@@ -67,7 +67,7 @@ def _rescale(
     weight: Float[Array, "k"],
     diameter: Float[Array, ""],
 ) -> Similarity:
-    """The same rotation at the given scale, about the centroid of the inliers, which stays where it was seen."""
+    """The pose with the given scale and the same rotation; the centroid of the inliers stays in place."""
     share = jnp.where(inliers, weight, 0)
     centroid = jnp.sum(share[:, None] * points, axis=0) / jnp.maximum(jnp.sum(share), 1e-9)
     moved = jnp.sum(pose.rotation * centroid[None], axis=-1)

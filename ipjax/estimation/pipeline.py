@@ -57,14 +57,14 @@ def estimate(
     """
     _check_shapes(templates, query)
     _check_encoders(encoder, templates, query)
-    (templates, known), (query, there) = finite_templates(templates), finite_query(query)
-    meant = known & there & _are_numbers(config)
-    # In the records' precision: under x64 numbers from elsewhere have another, and the pose would get it.
+    (templates, has_object), (query, has_camera) = finite_templates(templates), finite_query(query)
+    usable = has_object & has_camera & _are_numbers(config)
+    # In the precision of the records: under x64 Python's numbers are float64, and would make the pose so.
     config, diameter = jax.tree.map(lambda x: jnp.asarray(x, query.patches.points.dtype), (config, diameter))
     if diameter is not None:
-        diameter = jnp.asarray(diameter, query.view.depth.dtype)  # numbers of one's own are wider under x64
-        sized = jnp.isfinite(diameter) & (diameter > 0)
-        meant, diameter = meant & sized, jnp.where(sized, diameter, 1)
+        diameter = jnp.asarray(diameter, query.view.depth.dtype)
+        has_size = jnp.isfinite(diameter) & (diameter > 0)
+        usable, diameter = usable & has_size, jnp.where(has_size, diameter, 1)
     with jax.named_scope("match"):
         matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
@@ -73,7 +73,7 @@ def estimate(
     with jax.named_scope("align"):
         size = apparent_diameter(templates, query)[matches.view]
         poses, agreed, _, determined = align(pairs, size, key, config.align, diameter)
-        determined = determined & meant
+        determined = determined & usable
     scale_known = diameter is not None
     scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
     unknown = jnp.zeros_like(agreed)
@@ -89,7 +89,7 @@ def estimate(
     if config.refine.settle and config.refine.steps:
         found = _settle_best(templates, scene, found, pairs, config, scale_known=scale_known)
     best = jax.tree.map(lambda x: x[0], found)
-    # The pairs that speak for it are those of the view that agrees best, whichever view's hypothesis was refined to it.
+    # The pairs reported are those of the view with the most inliers, whichever view's hypothesis led to the pose.
     offset = jax.vmap(lambda one: best.poses @ one.object - one.camera)(pairs)
     squared = jnp.sum(offset**2, axis=-1)
     near = (pairs.weight > 0) & (squared < (config.align.threshold * best.poses.scale) ** 2) & best.determined
@@ -97,10 +97,10 @@ def estimate(
     matched, squared, used = jax.tree.map(lambda x: x[view], (pairs, squared, near))
     count = jnp.sum(used, dtype=jnp.int32)
     with jax.named_scope("confidence"):
-        sure = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
+        certainty = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
     found = PoseEstimate(
         camera_from_object=best.poses,
-        **sure,
+        **certainty,
         hypotheses=Hypotheses(found.poses, jnp.clip(found.score, 0, 1)),
         view=matches.view[view],
         view_score=matches.ranking,
@@ -128,11 +128,11 @@ class _Candidates(eqx.Module):
 def _settle_best(
     templates: Templates, scene: "SceneGrid", found: _Candidates, pairs: Pairs, config: Config, *, scale_known: bool
 ) -> _Candidates:
-    """The same, the first of them refined once more, for a mesh that may be wrong; the pairs are those of all views."""
-    held = jax.tree.map(lambda x: x[:, : config.refine.pairs].reshape(-1, *x.shape[2:]), pairs)
+    """The candidates, the best refined by `settle`, for errors of the mesh; the pairs are those of all views."""
+    strongest = jax.tree.map(lambda x: x[:, : config.refine.pairs].reshape(-1, *x.shape[2:]), pairs)
     with jax.named_scope("settle"):
         best = jax.tree.map(lambda x: x[0], found.poses)
-        moved = settle(templates.surface, scene.cloud, best, held, config.refine, scale_known=scale_known)
+        moved = settle(templates.surface, scene.cloud, best, strongest, config.refine, scale_known=scale_known)
     poses = jax.tree.map(lambda all_of_them, first: all_of_them.at[0].set(first), found.poses, moved)
     return eqx.tree_at(lambda f: f.poses, found, poses)
 
@@ -148,10 +148,10 @@ def _certainty(
     drawing: bool,
     scale_known: bool,
 ) -> dict[str, Any]:
-    """What an estimate says of itself; the candidates are sorted, the pairs are the best one's."""
+    """The fields of an estimate about its certainty; candidates best first, ``pairs`` of the best one."""
     best = jax.tree.map(lambda x: x[0], found)
     parts = found.agreement
-    # Not the score: the numbers that turn this into a probability outlive a change of its formula.
+    # Not the score: the fitted weights of the confidence remain valid when its formula changes.
     evidence = parts.depth * parts.features * parts.drawn if drawing else found.score
     rival = find_rival(found.poses, jnp.where(found.score > 0, evidence, 0))
     seen = seen_share(templates.surface, best.poses)
@@ -193,7 +193,7 @@ def _check_shapes(templates: Templates, query: Query) -> None:
 
 
 def _check_encoders(encoder: object, templates: Templates, query: Query) -> None:
-    """By identity, not by the length of features; what has no identity is not compared."""
+    """Refuse features of different encoders, by their identity; an encoder without one is not compared."""
     found = {
         "the object was onboarded with": templates.patches.encoder,
         "the query was described by": query.patches.encoder,
@@ -201,10 +201,10 @@ def _check_encoders(encoder: object, templates: Templates, query: Query) -> None
     }
     known = {what: identity for what, identity in found.items() if identity is not None}
     if len(set(known.values())) > 1:
-        told = ", ".join(f"{what} '{identity}'" for what, identity in known.items())
+        sources = ", ".join(f"{what} '{identity}'" for what, identity in known.items())
         raise ValueError(
-            f"{told}: features of different encoders cannot be compared; onboard the object again, or use the encoder "
-            "that it was made with"
+            f"{sources}: features of different encoders cannot be compared; onboard the object again, or use the "
+            "encoder that it was made with"
         )
 
 
@@ -222,7 +222,7 @@ class SceneGrid(eqx.Module):
         camera = resize(view.camera, (side, side), (grid, grid))
         covered = jnp.mean(view.mask.astype(view.depth.dtype).reshape(grid, side // grid, grid, -1), axis=(1, 3))
         self.mask = mask_from_coverage(covered)
-        # Of a cell that the object shares with what is behind it or before it, the depth of either alone.
+        # A cell at the object's border has the depth of the object, or of what is beside it, never their mean.
         of_both = lambda mask: lift(eqx.tree_at(lambda v: v.mask, view, mask), grid, grid, 0.05)
         points, share = jax.vmap(of_both)(jnp.stack([view.mask, ~view.mask]))
         known = (share > 0.3).reshape(2, grid, grid)
@@ -239,7 +239,7 @@ class SceneGrid(eqx.Module):
 
 
 def _extent(mask: Bool[Array, "h w"], depth: Float[Array, "h w"], camera: Camera) -> Float[Array, ""]:
-    """The root of the area that the mask covers, metres: how large things are here, roughly."""
+    """The square root of the area that the mask covers, metres: a rough size of the object."""
     return root(jnp.sum(jnp.where(mask, depth, 0) ** 2) / (camera.focal[0] * camera.focal[1]))
 
 
@@ -259,32 +259,33 @@ def _rounds(
             with jax.named_scope("refine"):
                 fit = lambda pose: refine(templates.surface, scene.cloud, pose, config.refine, scale_known=scale_known)
                 poses = jax.vmap(lambda pose: fit(pose)[0])(poses)
-        rated, agreement = _rate(templates, query, scene, poses, config)
+        rated, agreement = _score_all(templates, query, scene, poses, config)
         found = _Candidates(poses, determined, jnp.where(determined, rated, -1), agreement)
         if not turned:
             return given, found
-        # Nobody refines what the last round would turn.
+        # After the last round nothing is turned, for nothing would refine it.
         return lax.cond(last, lambda _: given, turn_best, found), found
 
     def turn_best(found):
         best = lax.top_k(found.score, turned)[1]
         determined = jnp.repeat(found.determined[best], TURNS)
         alternates = turn(jax.tree.map(lambda x: x[best], found.poses), templates.axes)
-        # Most turns explain little, which shows before they are refined.
-        promise = jnp.where(determined, _rate(templates, query, scene, alternates, config)[0], -1)
-        chosen = lax.top_k(promise, min(count, TURNS * turned))[1]
-        there = jnp.arange(count) < chosen.shape[0]  # what fills the round up is no hypothesis of its own
-        pick = lambda x: jnp.resize(x[chosen], (count, *x.shape[1:]))
-        return jax.tree.map(pick, alternates), pick(determined) & there
+        # Most turned poses score low before refinement already: only the best are refined.
+        unrefined = jnp.where(determined, _score_all(templates, query, scene, alternates, config)[0], -1)
+        chosen = lax.top_k(unrefined, min(count, TURNS * turned))[1]
+        padding = jnp.arange(count) >= chosen.shape[0]  # repeats, so that both rounds have the same number of poses
+        take = lambda x: jnp.resize(x[chosen], (count, *x.shape[1:]))
+        return jax.tree.map(take, alternates), take(determined) & ~padding
 
     rounds = jnp.array([False, True] if turned else [True])
     _, found = lax.scan(one_round, (first.poses, first.determined), rounds)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), found)
 
 
-def _rate(
+def _score_all(
     templates: Templates, query: Query, scene: SceneGrid, poses: Similarity, config: Config
 ) -> tuple[Float[Array, "h"], Agreement]:
+    """Scores of all poses without drawing them."""
     with jax.named_scope("score"):
         rate = lambda pose: score(
             None, templates, query, scene.depth, scene.mask, scene.cloud.camera, pose, config.score
@@ -361,7 +362,7 @@ def comparable(templates: Templates, query: Patches, config: Config = Config()) 
     if config.match.centred:
         features = object_features(query.features, templates)
         return eqx.tree_at(lambda q: q.features, query, features), templates
-    features = jnp.where(templates.patches.valid[..., None], templates.patches.features, 0)  # others may be no numbers
+    features = jnp.where(templates.patches.valid[..., None], templates.patches.features, 0)  # invalid ones may hold NaN
     raw = features.astype(templates.mean.dtype) * templates.norm[..., None]
     if templates.basis is not None:
         raw = jnp.matmul(raw, templates.basis, precision="highest")

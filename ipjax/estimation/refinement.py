@@ -2,12 +2,12 @@
 
 Both directions are associated: surface points with the depth they project to, and depth points with their nearest
 surface point. One direction alone lets a free scale shrink or grow the object along the rays. The object's silhouette
-is fitted to the mask's border, which fixes the size that depth leaves loose; surface that projects beside the mask
-costs as much as a point can. Neither counts where something hides the object.
+is fitted to the mask's border, which determines the size better than depth does; surface that projects outside the
+mask costs the maximum of the loss. Neither counts where an occluder hides the object.
 
-A mesh may be wrong. At the end (:func:`settle`) its proportions give way where the image insists, so that less is
-turned or moved to make up for them; or, where its surface is uneven, the fit forgives as much as it is off, and the
-pairs of patches hold what the surface lets slide.
+A mesh may be wrong. A last refinement (:func:`settle`) may change its proportions, so that the pose need not make up
+for them; or, where its surface is uneven, it widens the losses, and matched pairs of patches constrain the motion that
+the surface no longer does.
 """
 
 import functools
@@ -145,14 +145,14 @@ def settle(
     *,
     scale_known: bool = False,
 ) -> Similarity:
-    """The last refinement of the chosen hypothesis, for a mesh that may be wrong in either of two ways.
+    """The last refinement of the chosen hypothesis, for a mesh that is wrong in one of two ways.
 
-    Its proportions may be wrong: a symmetric strain explains the image. That explains a wrong pose, too, so it is for
-    the last step only, and taken only where the cost falls by ``config.gain``; its losses keep their width in metres,
-    or a mesh whose proportions are free would grow to widen them. Or its surface is uneven, by
-    :func:`unevenness`: then the losses are as wide as ``config.forgiveness`` times that, and the more they are widened
-    the more the pairs count, which the shape of the surface does not pull. On an even surface of the right proportions
-    it is one more :func:`refine`.
+    Its proportions may be wrong: then a symmetric strain is fitted with the pose. Strain can explain a wrong pose, too;
+    so it is fitted in this last step only, and used only where the cost falls by the share ``config.gain``. The losses
+    keep their width in metres, or the mesh would grow to widen them. Or its surface may be uneven (:func:`unevenness`):
+    then the losses are ``config.forgiveness`` times as wide as that, and the wider they are, the more weight the pairs
+    get, which do not depend on the shape of the surface. On an even surface of the right proportions it is one more
+    :func:`refine`.
 
     Args:
       surface, cloud, scale_known: as for :func:`refine`.
@@ -170,7 +170,7 @@ def settle(
         allowed = eqx.tree_at(fields, config, changed)
         return _fit(surface, cloud, camera_from_object, pairs, allowed, unit, rigid=rigid, strains=STRAINS)
 
-    # One body for both ways, so that it is compiled once: proportions give way, or (all but) nothing does.
+    # One function for both cases, so that it is compiled once: with free proportions, and with (almost) fixed ones.
     one = jnp.ones_like(width)
     ways = (
         jnp.stack([config.strain * one, 1e-3 * config.strain * one]),
@@ -189,9 +189,9 @@ STRAINS = 5  # of a symmetric matrix without a trace
 def unevenness(
     surface: Surface, cloud: Cloud, camera_from_object: Similarity, config: RefineConfig = RefineConfig()
 ) -> Float[Array, ""]:
-    """How far the surface is off the measured depth, in diameters: the standard deviation, from the median.
+    """The standard deviation of the surface from the measured depth, in diameters, along its normals.
 
-    Over depth points within ``_UNRELATED`` of visible surface; along its normal.
+    From the median, over depth points within ``_UNRELATED`` of visible surface.
     """
     points, normals = surface.points[: config.points], surface.normals[: config.points]
     placed, facing, visible = _place(camera_from_object, points, normals)
@@ -204,7 +204,7 @@ def unevenness(
     return 1.48 * jnp.where(jnp.any(near), median, 0)
 
 
-_UNRELATED = 0.15  # diameters: what is farther from the surface than this belongs to something else
+_UNRELATED = 0.15  # diameters: depth farther from the surface than this is taken for another object's
 
 
 def _fit(
@@ -218,7 +218,7 @@ def _fit(
     rigid: int,
     strains: int = 0,
 ) -> tuple[Similarity, Float[Array, ""], Float[Array, ""]]:
-    """The pose of least squares, its mean robust cost and the start's; the start where nothing finite is better.
+    """The least-squares pose, its mean robust cost and that of the start; the start itself where none is better.
 
     Free are ``rigid`` coordinates of :func:`retract` and then strains. ``unit``: as for :func:`_terms`.
     """
@@ -226,25 +226,25 @@ def _fit(
     if not config.steps:
         cost = _cost(start, jnp.zeros(rigid + strains, start.translation.dtype), *given, rigid=rigid)
         return start, cost, cost
-    # Nothing of the derivative goes through the start, and the graph need not hold what it would be multiplied by.
+    # The derivative at the minimum does not depend on the start: the graph need not hold that of the start.
     pose, _, cost, before = _search(rigid, strains, lax.stop_gradient(start), *given)
     return pose, cost, before
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _search(rigid, strains, start, surface, cloud, pairs, config, unit):
-    """The pose, the strain, their cost and the start's; the derivative is that of the minimum that they are at."""
+    """The pose and strain at the minimum, their cost and that of the start; differentiated as an implicit function."""
     given = surface, cloud, pairs, config, unit
     zero = jnp.zeros(rigid + strains, start.translation.dtype)
 
     def linear(step, _):
-        here = lax.stop_gradient(step)
-        value, slopes = _linearise(start, here, *given, rigid=rigid)
-        # What the solver differentiates is linear; the added zero has the slopes.
-        return value + jnp.sum(slopes * (step - here), axis=1)
+        point = lax.stop_gradient(step)
+        value, slopes = _linearise(start, point, *given, rigid=rigid)
+        # The sum is zero and has the slopes as its derivative: the solver differentiates a linear function.
+        return value + jnp.sum(slopes * (step - point), axis=1)
 
     solver = optx.LevenbergMarquardt(rtol=1e-4, atol=1e-5, linear_solver=NormalEquations())
-    solver = eqx.tree_at(lambda s: s.search, solver, _Remembering(optx.ClassicalTrustRegion()))
+    solver = eqx.tree_at(lambda s: s.search, solver, _SearchWithFirstValue(optx.ClassicalTrustRegion()))
     solution = optx.least_squares(linear, solver, zero, max_steps=config.steps, throw=False)
     residuals = solution.state.f_info.residual
     before = 2 * solution.state.search_state.first / (residuals.shape[0] - strains)
@@ -256,8 +256,8 @@ def _search(rigid, strains, start, surface, cloud, pairs, config, unit):
 
 @_search.defjvp
 def _differentiate_search(rigid, strains, primals, tangents):
-    # At a minimum the slope of the cost is zero, and stays so: H step' + (slope of the cost)' = 0. With H exact, not
-    # Gauss and Newton's: the losses bend, and what residuals are left bends them more.
+    # At a minimum the gradient of the cost is zero, and stays so: H step' + (gradient)' = 0. With the exact Hessian H,
+    # not Gauss and Newton's, which lacks the curvature of the losses and of the residuals.
     found = _search(rigid, strains, *primals)
     pose, strain, _, _ = found
     given, changes = primals[1:], tangents[1:]
@@ -285,28 +285,28 @@ def _mean_square(values, strains):  # the prior adds to it but is no residual of
     return jnp.sum(values**2) / (values.shape[0] - strains)
 
 
-class _Searched(eqx.Module):
-    """The state of a search, and the function's value where it began, which need not be computed once more."""
+class _SearchState(eqx.Module):
+    """The state of a search, and the function's value at the start, so that it need not be computed again."""
 
     inner: Any
     first: Float[Array, ""]
 
 
-class _Remembering(optx.AbstractSearch[Any, Any, Any, _Searched]):
-    """A search in the precision of what is searched (Optimistix has the default precision), with the first value."""
+class _SearchWithFirstValue(optx.AbstractSearch[Any, Any, Any, _SearchState]):
+    """A search that keeps the first value, in the precision of its argument (Optimistix uses the default precision)."""
 
     inner: optx.AbstractSearch
 
-    def init(self, y: Any, f_info_struct: Any) -> _Searched:
+    def init(self, y: Any, f_info_struct: Any) -> _SearchState:
         inner = jax.tree.map(lambda x: x.astype(y.dtype), self.inner.init(y, f_info_struct))
-        return _Searched(inner, jnp.zeros((), y.dtype))
+        return _SearchState(inner, jnp.zeros((), y.dtype))
 
     def step(
-        self, first_step: Any, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, state: _Searched
-    ) -> tuple[Any, Any, optx.RESULTS, _Searched]:
+        self, first_step: Any, y: Any, y_eval: Any, f_info: Any, f_eval_info: Any, state: _SearchState
+    ) -> tuple[Any, Any, optx.RESULTS, _SearchState]:
         size, accept, result, inner = self.inner.step(first_step, y, y_eval, f_info, f_eval_info, state.inner)
         first = jnp.where(first_step, f_eval_info.as_min(), state.first)
-        return size, accept, result, _Searched(inner, first)
+        return size, accept, result, _SearchState(inner, first)
 
 
 @functools.partial(jax.jit, static_argnames="rigid")  # so that it is traced once
@@ -359,7 +359,7 @@ def _terms(
     values = _residuals(moved, jnp.where(unit > 0, unit, moved.scale), surface, cloud, pairs, config)
     # So that the mean square is in [0, 1].
     spread = jnp.sqrt(values.shape[0] / _weight(config, pairs, step.dtype))
-    # One standard deviation costs as much as if a hundredth of the surface were lost.
+    # A strain of one standard deviation costs as much as a hundredth of the surface without a match.
     return jnp.concatenate([values * spread, strain / config.strain * (0.1 * spread)])
 
 
@@ -382,7 +382,7 @@ def _stretch(vectors: Float[Array, "n 3"], strain: Float[Array, "5"]) -> Float[A
 
 
 def _weight(config: RefineConfig, pairs: Pairs | None, dtype: Any) -> Float[Array, ""]:
-    """What the squares of all residuals can sum to: 1 for each direction of the depth association, and the rest."""
+    """The largest sum of squares of all residuals: 1 for each direction of the depth association, and the weights."""
     weight = 2 + jnp.asarray(config.silhouette_weight, dtype)
     return weight if pairs is None else weight + jnp.asarray(config.pair_weight, dtype)
 
@@ -447,7 +447,7 @@ def _depth_terms(moved, unit, points, normals, trust, cloud, config):
     nearest = lax.stop_gradient(_nearest_visible(targets, placed, visible))
     backward = _robust(placed[nearest] - targets, facing[nearest], known, unit, config)
     backward = jnp.where(known, backward * jnp.sqrt(trust[nearest]), 0)
-    # Hiding most of itself must not pay.
+    # At least a third of the visible points count: else a pose whose points are mostly occluded would cost little.
     count = jnp.maximum(jnp.sum(counted), jnp.sum(visible) // 3)
     return _averaged(forward, lax.stop_gradient(count)), _averaged(backward, jnp.sum(known))
 
@@ -487,8 +487,8 @@ def _cells(placed, cloud):
 
 
 def _robust(offset, normal, ok, unit, config):
-    """Geman–McClure on the point-to-plane distance; unmatched points cost the maximum, 1, so that losing a match
-    never pays."""
+    """Geman–McClure on the point-to-plane distance; points without a match cost the maximum, 1, so that no pose gains
+    by losing matches."""
     plane = jnp.sum(offset * normal, axis=-1)
     tangent = jnp.sum(offset * offset, axis=-1) - plane**2
     squared = (plane**2 + 0.05 * jnp.maximum(tangent, 0)) / (config.width * unit) ** 2
@@ -496,7 +496,7 @@ def _robust(offset, normal, ok, unit, config):
     return jnp.where(near, jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
 
 
-_TOGETHER = 8  # points compared in one step on a CPU
+_POINTS_PER_STEP = 8  # that are compared in one step on a CPU
 
 
 def _nearest_visible(targets, placed, visible):
@@ -506,11 +506,11 @@ def _nearest_visible(targets, placed, visible):
         # A CPU vectorises neither an argmin nor a minimum along the last axis. This compares a few points at a time
         # with the nearest so far of all targets.
         count = placed.shape[0]
-        padding = -count % _TOGETHER
+        padding = -count % _POINTS_PER_STEP
         parts = (
-            jnp.pad(placed, ((0, padding), (0, 0))).reshape(-1, _TOGETHER, 3),
-            jnp.pad(visible, (0, padding)).reshape(-1, _TOGETHER),
-            jnp.arange(count + padding, dtype=jnp.int32).reshape(-1, _TOGETHER),
+            jnp.pad(placed, ((0, padding), (0, 0))).reshape(-1, _POINTS_PER_STEP, 3),
+            jnp.pad(visible, (0, padding)).reshape(-1, _POINTS_PER_STEP),
+            jnp.arange(count + padding, dtype=jnp.int32).reshape(-1, _POINTS_PER_STEP),
         )
 
         def compare(best, part):

@@ -1,8 +1,8 @@
 """How well a hypothesis explains the query: its depth, its mask, and its features.
 
-Depth comes from splatting the object's surface points; features from the templates whose viewpoints are nearest to the
-hypothesis', carried on their 3-D points into the query's feature map. The best few can be drawn exactly as they would
-be seen and described again, which tells a bottle's front from its back where a template 15° away does not.
+Depth comes from splatting the object's surface points; features from the templates of the nearest viewpoints, whose
+3-D points are projected into the query's feature map. The best few hypotheses can be drawn and described at their exact
+pose, which distinguishes a bottle's front from its back where a template 15° away does not.
 """
 
 from collections.abc import Callable
@@ -33,8 +33,8 @@ def score(
 ) -> tuple[Float[Array, ""], Agreement]:
     """The score in [0, 1] of one hypothesis, and its parts; the caller vmaps.
 
-    Where the hypothesis is drawn, depth counts less than features, for a wrong mesh often fits its depth better turned
-    wrong, and colours count, too.
+    Where the hypothesis is drawn, colours count, too, and depth counts less than features: with errors of the mesh a
+    wrong rotation often fits the depth better.
 
     Args:
       encoder: with it the hypothesis is drawn and described, too; None = it is not.
@@ -65,10 +65,10 @@ def depth_agreement(
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
 ) -> Float[Array, ""]:
-    """Share of what is seen of the object or its mask where predicted and measured depth agree.
+    """The share of the union of mask and visible surface where predicted and measured depth agree.
 
-    A measurement nearer than predicted and outside the mask is an occluder and counts neither way; a farther one
-    says that the object is not there.
+    Where a measurement outside the mask is nearer than predicted, an occluder hides the object: the place is left out.
+    A measurement that is farther is a disagreement.
     """
     height, width = depth.shape
     placed = camera_from_object @ surface.points
@@ -85,9 +85,9 @@ def depth_agreement(
 
 
 def seen_share(surface: Surface, camera_from_object: Similarity) -> Float[Array, ""]:
-    """How much of the surface that a hypothesis shows the camera was seen by the reconstruction; the rest is guessed.
+    """The share of the surface facing the camera at a hypothesis that its reconstruction saw; the rest is guessed.
 
-    By area in the image; what the object itself hides counts, too.
+    By area in the image; surface that other parts of the object hide counts, too.
     """
     placed = camera_from_object @ surface.points
     facing = -jnp.sum(_turn_normals(camera_from_object, surface.normals) * placed, axis=-1)
@@ -126,15 +126,15 @@ def feature_agreement(
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
 ) -> Float[Array, ""]:
-    """Cosine in [0, 1] between the patches of the nearest templates, moved by the hypothesis, and the query there.
+    """Cosine in [0, 1] between the patches of the nearest templates and the query's where the hypothesis puts them.
 
     Patches behind an occluder are left out; those that fall outside the mask count as zero. Templates are weighted by
     the angle between their viewpoint and the hypothesis'.
     """
-    there = jnp.any(templates.patches.valid, axis=1)
+    has_patches = jnp.any(templates.patches.valid, axis=1)
     nearness = jnp.where(there, -closeness(templates, camera_from_object), -10)
     angle, views = lax.top_k(nearness, min(config.views, templates.norm.shape[0]))
-    weight = jnp.where(there[views], jnp.exp(-jnp.square(angle / config.spread)), 0)
+    weight = jnp.where(has_patches[views], jnp.exp(-jnp.square(angle / config.spread)), 0)
     near = jax.tree.map(lambda x: x[views], templates.patches)
     cosines = jax.vmap(lambda patches: _carried_cosine(patches, query, camera_from_object, config))(near)
     return jnp.clip(jnp.sum(weight * cosines) / jnp.maximum(jnp.sum(weight), 1e-9), 0, 1)
@@ -147,18 +147,17 @@ def drawn_agreement(
     camera_from_object: Similarity,
     config: ScoreConfig = ScoreConfig(),
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """How like the query's patches those of the object are, drawn where the hypothesis puts it: features and colours.
+    """How similar the object, drawn at the hypothesis, is to the query: in features and in colours.
 
-    What an occluder hides is not drawn.
+    Surface behind an occluder is not drawn.
 
     Args:
       templates: of the object, with its appearance.
       query: its patches centred on the templates' mean, as the templates' are.
 
     Returns:
-      The cosine of the features in [0, 1], summed over patches by the cover that both have, over the cover that either
-      has: what sticks out of the mask, and what of the mask is left empty, counts as zero. And the
-      :func:`chroma_correlation` of the patches' mean colours.
+      The cosine of the features in [0, 1], averaged over the union of what is drawn and the mask, where what is in only
+      one of them counts as zero. And the :func:`chroma_correlation` of the patches' mean colours.
 
     Raises:
       ValueError: the templates have no appearance.
@@ -190,11 +189,11 @@ def drawn_agreement(
 def chroma_correlation(
     first: Float[Array, "p 3"], second: Float[Array, "p 3"], weight: Float[Array, "p"]
 ) -> Float[Array, ""]:
-    """How alike colours are spread over two images, whatever their light, shade and tint: in [-1, 1], 0 if one is grey.
+    """Correlation of the colours of two images, independent of light, shade and tint: in [-1, 1], 0 if one is grey.
 
-    The encoder's features hardly tell colours, and a reconstruction that has lost its sharp texture still has them.
-    Each colour is taken relative to its brightness, or a thing that is red all over would show in its chroma where the
-    light fell, which was elsewhere when it was reconstructed.
+    The encoder's features hardly depend on colour, and a reconstruction with a blurred texture still has its colours.
+    Colours are divided by their brightness: else the chroma of an object of one colour would vary with the light, which
+    was another when it was reconstructed.
 
     Args:
       first, second: mean colours of the patches, in [0, 1].
@@ -212,14 +211,14 @@ def chroma_correlation(
     return jnp.sum(mean(a * b)) / (variance + _GREY)
 
 
-_DARK = 0.3  # brightness below which colours count less, for they drown in noise
-_GREY = 1.5e-3  # variance of chroma below which it is the camera's noise
+_DARK = 0.3  # brightness below which chroma is reduced, for it is mostly noise
+_GREY = 1.5e-3  # variance of chroma that is attributed to the camera's noise
 
 
 def _patch_colour(
     image: Float[Array, "h w 3"], mask: Bool[Array, "h w"], rows: int, columns: int
 ) -> Float[Array, "p 3"]:
-    """Mean colour of what is set of each patch."""
+    """Mean colour of the pixels of each patch that are in the mask."""
     height, width = mask.shape
     shape = rows, height // rows, columns, width // columns, -1
     total = lambda x: jnp.sum(x.reshape(shape), axis=(1, 3)).reshape(rows * columns, -1)
@@ -240,7 +239,7 @@ def _carried_cosine(
     inside = _patch_cover(query.view.mask, rows, columns) > 0.25
     sampled, share = _sample(query.patches.features, inside, cell, rows, columns)
     norm = jnp.sqrt(jnp.sum(sampled * sampled, axis=-1) + 1e-12)
-    features = jnp.where(patches.valid[:, None], patches.features, 0)  # what is not valid may not be a number
+    features = jnp.where(patches.valid[:, None], patches.features, 0)  # invalid ones may hold NaN
     cosine = jnp.sum(sampled * features.astype(sampled.dtype), axis=-1) / norm
     column = jnp.clip(jnp.round(pixel[:, 0]).astype(jnp.int32), 0, width - 1)
     row = jnp.clip(jnp.round(pixel[:, 1]).astype(jnp.int32), 0, height - 1)
@@ -254,7 +253,7 @@ def _carried_cosine(
 def _facing(
     placed: Float[Array, "n 3"], normals: Float[Array, "n 3"], camera_from_object: Similarity
 ) -> Bool[Array, "n"]:
-    """Which of the points placed in the camera frame show it their front."""
+    """Which of the points in the camera frame face the camera."""
     return jnp.sum(_turn_normals(camera_from_object, normals) * placed, axis=-1) < 0
 
 
@@ -263,7 +262,7 @@ def _turn_normals(camera_from_object: Similarity, normals: Float[Array, "n 3"]) 
 
 
 def _patch_cover(pixels: Bool[Array, "h w"], rows: int, columns: int) -> Float[Array, "p"]:
-    """The share of each patch that is set."""
+    """The share of each patch's pixels that are set."""
     height, width = pixels.shape
     patches = pixels.astype(jnp.float32).reshape(rows, height // rows, columns, width // columns)
     return jnp.mean(patches, axis=(1, 3)).reshape(-1)
