@@ -132,7 +132,7 @@ def feature_agreement(
     the angle between their viewpoint and the hypothesis'.
     """
     has_patches = jnp.any(templates.patches.valid, axis=1)
-    nearness = jnp.where(there, -closeness(templates, camera_from_object), -10)
+    nearness = jnp.where(has_patches, -closeness(templates, camera_from_object), -10)
     angle, views = lax.top_k(nearness, min(config.views, templates.norm.shape[0]))
     weight = jnp.where(has_patches[views], jnp.exp(-jnp.square(angle / config.spread)), 0)
     near = jax.tree.map(lambda x: x[views], templates.patches)
