@@ -28,7 +28,7 @@ def time_in_turns(
 
     With ``rest``, each timed call follows a pause of that many seconds and untimed calls for as long. Libraries with
     threads of their own need it: threads that have just worked go on spinning (OpenBLAS's do) and take the
-    cores from whoever comes next, and those that wake up share a core for about as long.
+    cores from the next call, and those that wake up share a core for about as long.
     """
     for call in calls.values():
         jax.block_until_ready(call())

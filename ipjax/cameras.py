@@ -1,10 +1,10 @@
 """Pinhole geometry: projecting, lifting, and what becomes of a camera when its image is cropped, resized, subsampled or
 turned.
 
-Pixel centres are integers (OpenCV, BOP). This is the only place that knows what follows from that: whoever changes an
-image calls :func:`crop`, :func:`resize` or :func:`subsample` for its camera, and the functions of the same names for
-pixels; whoever hands a camera to something that measures from the pixels' edges calls :func:`borders`. Sizes and places
-are (x, y): width first. A camera is a :class:`Camera` in the graph, or a 3 × 3 matrix K in NumPy on the host.
+Pixel centres are integers (OpenCV, BOP). Only this module handles the half pixel that follows from it: code that
+changes an image calls :func:`crop`, :func:`resize` or :func:`subsample` for its camera, and :func:`crop_pixels` and so
+on for pixels; code that measures from the edges of pixels gets :func:`borders`. Sizes and places are (x, y): width
+first. A camera is a :class:`Camera` in the graph, or a 3 × 3 matrix K in NumPy on the host.
 """
 
 from typing import Any, TypeVar

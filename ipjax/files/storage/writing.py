@@ -116,7 +116,7 @@ def read_lines(path: str | Path, *, repair: bool = False) -> list[str]:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove unfinished files that nobody has changed for a day; a folder is searched once an hour."""
+    """Remove unfinished files that have not changed for a day; a folder is searched once an hour."""
     now = time.monotonic()
     if now - _searched.get(folder, -_SEARCH_AGAIN) < _SEARCH_AGAIN:
         return
