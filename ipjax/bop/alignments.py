@@ -42,7 +42,7 @@ def align(estimate: Estimate, model_from_mesh: Similarity[np.ndarray]) -> Estima
     return Estimate(estimate.obj_id, estimate.score, pose.rotation, pose.translation, float(pose.scale))
 
 
-def describe_alignments(alignments: Mapping[int, Similarity], aligned_by: Mapping[int, str]) -> list[str]:
+def describe_alignments(alignments: Mapping[int, Similarity[np.ndarray]], aligned_by: Mapping[int, str]) -> list[str]:
     """Sentences that a table of scores has under it: which objects were moved, and by what."""
     by_source: dict[str, list[int]] = {}
     for obj_id in sorted(alignments):

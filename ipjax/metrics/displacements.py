@@ -38,14 +38,18 @@ def apply_matrix(matrix: Float[A, "*b 3 3"], points: Float[A, "*c n 3"]) -> Floa
     if namespace(matrix, points) is np:
         return points @ np.swapaxes(matrix, -1, -2)
     # Sums of products, not a matrix product: exact in float32 on every backend.
-    return sum(matrix[..., None, :, i] * points[..., :, i, None] for i in range(3))
+    x, y, z = (matrix[..., None, :, i] * points[..., :, i, None] for i in range(3))
+    return x + y + z
 
 
 def lengths(vectors: Float[A, "*b n"]) -> Float[A, "*b"]:
     """Euclidean lengths along the last axis; in JAX with a finite gradient at 0."""
+    found: Any
     if namespace(vectors) is np:
-        return np.asarray(np.linalg.norm(vectors, axis=-1))
-    return root(jnp.sum(vectors**2, axis=-1))
+        found = np.asarray(np.linalg.norm(vectors, axis=-1))
+    else:
+        found = root(jnp.sum(vectors**2, axis=-1))
+    return found
 
 
 def away_from_zero(depth: Any) -> Any:
