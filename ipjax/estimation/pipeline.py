@@ -18,7 +18,7 @@ from ipjax.estimation.confidence import covariance, find_rival, pair_information
 from ipjax.estimation.features import identity_of, lift, object_features
 from ipjax.estimation.matching import match, select
 from ipjax.estimation.refinement import Cloud, information, refine, settle, trace_contour
-from ipjax.estimation.scoring import score, seen_share
+from ipjax.estimation.scoring import score, score_drawn, seen_share
 from ipjax.estimation.validity import finite_estimate, finite_query, finite_templates
 from ipjax.metrics.poses import turn_angle
 from ipjax.records import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
@@ -82,8 +82,8 @@ def estimate(
     drawing = encoder is not None and templates.appearance is not None and config.score.drawn > 0
     if config.score.ranking == "render":
         found = _rounds(templates, query, scene, found, config, scale_known=scale_known)
-        if drawing:
-            found = _draw_best(encoder, templates, query, scene, found, config)
+        if encoder is not None and drawing:
+            found = _draw_best(encoder, templates, query, found, config)
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
     if config.refine.settle and config.refine.steps:
@@ -294,10 +294,9 @@ def _score_all(
 
 
 def _draw_best(
-    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
     templates: Templates,
     query: Query,
-    scene: SceneGrid,
     found: _Candidates,
     config: Config,
 ) -> _Candidates:
@@ -305,11 +304,13 @@ def _draw_best(
     count = min(config.score.drawn, found.score.shape[0])
     chosen, ahead = distinct(found.poses, found.score, count, config.score.apart)
     kept = jax.tree.map(lambda x: x[chosen], found)
-    camera = scene.cloud.camera
-    rate = lambda pose: score(encoder, templates, query, scene.depth, scene.mask, camera, pose, config.score)
+    # Compiled for one platform, but traced for both: jitted, it is traced once.
+    rate = jax.jit(lambda one: score_drawn(encoder, templates, query, *one, config.score))
     with jax.named_scope("draw"):
         # One image at a time is fastest on a CPU; accelerators want them all.
-        rated, agreement = lax.platform_dependent(kept.poses, cpu=lambda p: lax.map(rate, p), default=jax.vmap(rate))
+        rated, agreement = lax.platform_dependent(
+            (kept.poses, kept.agreement), cpu=lambda x: lax.map(rate, x), default=jax.vmap(rate)
+        )
     determined = kept.determined & ahead
     return _Candidates(kept.poses, determined, jnp.where(determined, rated, -1), agreement)
 

@@ -5,6 +5,7 @@ Depth comes from splatting the object's surface points; features from the templa
 pose, which distinguishes a bottle's front from its back where a template 15° away does not.
 """
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -43,20 +44,36 @@ def score(
     """
     geometry = depth_agreement(templates.surface, depth, mask, camera, camera_from_object, config)
     features = feature_agreement(templates, query, camera_from_object, config)
+    one, later = jnp.ones_like(geometry), jnp.zeros_like(geometry)  # only the chosen one needs what comes later
+    undrawn = Agreement(geometry, features, drawn=one, colour=later, seen=later, rival=later)
     if encoder is None:
-        drawn, colour = jnp.ones_like(geometry), jnp.zeros_like(geometry)
-        total = geometry * features**config.power
-    else:
-        drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
-        # What a guessed surface looks like says little, be it like the photo or unlike it.
-        trust = seen_share(templates.surface, camera_from_object)
-        known = lambda agreement: trust * agreement + (1 - trust) * config.guess
-        looks = known(features) ** config.power * known(drawn)
-        total = geometry**config.depth_power * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
-    later = jnp.zeros_like(geometry)  # what only the chosen one needs
-    return total, Agreement(geometry, features, drawn, colour, seen=later, rival=later)
+        return geometry * features**config.power, undrawn
+    return score_drawn(encoder, templates, query, camera_from_object, undrawn, config)
 
 
+def score_drawn(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
+    templates: Templates,
+    query: Query,
+    camera_from_object: Similarity,
+    undrawn: Agreement,
+    config: ScoreConfig = ScoreConfig(),
+) -> tuple[Float[Array, ""], Agreement]:
+    """:func:`score` with the encoder, where the agreement without it is known.
+
+    Args:
+      undrawn: of the same hypothesis, as :func:`score` without an encoder returns it.
+    """
+    drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
+    # What a guessed surface looks like says little, be it like the photo or unlike it.
+    trust = seen_share(templates.surface, camera_from_object)
+    known = lambda agreement: trust * agreement + (1 - trust) * config.guess
+    looks = known(undrawn.features) ** config.power * known(drawn)
+    total = undrawn.depth**config.depth_power * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
+    return total, dataclasses.replace(undrawn, drawn=drawn, colour=colour)
+
+
+@jax.jit  # so that it is traced once
 def depth_agreement(
     surface: Surface,
     depth: Float[Array, "g g"],
@@ -120,6 +137,7 @@ def look_along(ray: Float[Array, "3"]) -> Float[Array, "3 3"]:
     )
 
 
+@jax.jit  # so that it is traced once
 def feature_agreement(
     templates: Templates,
     query: Query,
