@@ -93,7 +93,7 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
     templates, info = onboard(mesh_file, encoder, out=folder / f"{kind}{SUFFIX}")
     say(f"onboarded: {len(templates.camera_from_object.scale)} templates")
 
-    estimator = Estimator([(templates, info)], encoder, config)
+    estimator = Estimator([(templates, info)], encoder, config, quick=True)
     result = estimator.run(0, *estimator.frame(0, scene.rgb, scene.depth, scene.masks[0], scene.matrix))
     seconds = ", ".join(f"{name} {value:.2f} s" for name, value in result.seconds.items())
     say(f"estimated ({seconds})")

@@ -92,7 +92,9 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.inference.estimator import Estimator
     from ipjax.inference.reports import CONVENTIONS, to_json
 
-    estimator = Estimator(objects, encoder, config, crop=arguments.crop, depth_scale=arguments.depth_scale)
+    estimator = Estimator(
+        objects, encoder, config, quick=not many, crop=arguments.crop, depth_scale=arguments.depth_scale
+    )
     entries: list[dict[str, Any]] = []
     for files in frames:
         try:

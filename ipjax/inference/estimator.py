@@ -20,6 +20,10 @@ from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
 # Compacted templates have a multiple of so many patches: each count is compiled anew, and most objects now share two.
 MULTIPLE = 64
 
+# XLA's options on a CPU that compile in about 60 % of the time what then takes a tenth longer; see
+# benchmarks/results/compiling.md. Rounding differs, as from one processor to another.
+QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False}
+
 
 @dataclasses.dataclass(frozen=True)
 class Result:
@@ -44,6 +48,7 @@ class Estimator:
         objects: templates and what is known of them, as `ipjax.load` returns them.
         encoder: made the templates' features.
         config: of the estimate.
+        quick: compile with `QUICK` on a CPU, for one frame or a few.
         options: of `ipjax.inference.frames.frame_turned`; "square" crops by default.
     """
 
@@ -52,11 +57,14 @@ class Estimator:
         objects: Sequence[tuple[Templates, ObjectInfo]],
         encoder: Any,
         config: Config = Config(),
+        *,
+        quick: bool = False,
         **options: Any,
     ):
         self.objects = list(objects)
         self.encoder = encoder
         self.config = config
+        self.quick = quick
         self.options: dict[str, Any] = {"crop": "square"} | options
         self._compiled: dict[Any, Any] = {}
         self._compacted: dict[int, Templates] = {}
@@ -121,7 +129,8 @@ class Estimator:
         key = (name, structure, shapes)
         if key not in self._compiled:
             start = time.perf_counter()
-            self._compiled[key] = jax.jit(function).lower(*args).compile()
+            options = QUICK if self.quick and jax.default_backend() == "cpu" else None
+            self._compiled[key] = jax.jit(function).lower(*args).compile(compiler_options=options)
             seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - start
         return self._compiled[key]
 
