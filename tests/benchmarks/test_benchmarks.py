@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import ablation, calibration, table
+from benchmarks import ablation, calibration, compiling, table
 from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from benchmarks.photo_pairs import camera_from_true_mesh
 from benchmarks.results_page.runs import Study
 from ipjax.config import ConfidenceConfig, Config
 from ipjax.estimation.confidence import probability
 from ipjax.files.settings import describe_config, read_config
+from ipjax.inference.estimator import QUICK
 from ipjax.records import Agreement, Similarity
 from ipjax.synthetic.degradation import degrade
 from ipjax.synthetic.objects import make_object
@@ -206,3 +207,13 @@ def test_objects_that_judge_are_not_those_that_fit(tmp_path):
     assert "expected calibration error" in text and sum(count for *_, count in diagram) == 8
     calibration.draw(diagram, tmp_path / "diagram.png")
     assert (tmp_path / "diagram.png").stat().st_size > 1000
+
+
+def test_compilation_is_measured_anew_each_time():
+    found = [compiling.measure(jnp.sort, (jnp.arange(3.0)[::-1],), options) for options in (None, QUICK)]
+    assert all(took[name] > 0 for took, _ in found for name in ("trace", "xla", "clock"))
+    assert [float(compiled(jnp.array([2.0, 1.0, 0.0]))[0]) for _, compiled in found] == [0, 0]
+    pose = Similarity(jnp.eye(3), jnp.zeros(3), jnp.asarray(2.0))
+    moved = Similarity(jnp.eye(3), jnp.array([0.0, 0.2, 0.0]), jnp.asarray(2.0))
+    near, off = (SimpleNamespace(camera_from_object=x) for x in (pose, moved))
+    assert compiling.far(near, near) == 0 and compiling.far(near, off) == pytest.approx(0.1)

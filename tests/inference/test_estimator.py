@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from builders.estimates import make_estimate
 
+from ipjax.config import Config
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.batching import compact
 from ipjax.inference.estimator import MULTIPLE, Estimator, to_image_camera
@@ -78,6 +79,20 @@ def test_the_estimator_compares_compacted_templates(monkeypatch):
     assert [templates.norm.shape for templates in given] == [small.norm.shape] * 4
     assert given[0] is given[1] is result.templates and float(given[3].mean[0] - given[0].mean[0]) == 1
     assert isinstance(result.query, Query)
+
+
+def test_what_compiles_quickly_answers_the_same():
+    templates, (query, _) = problems.make_templates(4), problems.make_query(3)
+    still = Similarity(jnp.eye(3), jnp.zeros(3), jnp.asarray(1.0))
+    found = []
+    for quick in (False, True):
+        estimator = Estimator([(templates, ObjectInfo("ball", "none"))], None, Config.paper(), quick=quick)
+        found.append(estimator.run(0, query.view, still, patches=query.patches).estimate)
+    first, second = (x.camera_from_object for x in found)
+    assert bool(found[0].success) and bool(found[1].success)
+    np.testing.assert_allclose(second.rotation, first.rotation, atol=1e-4)
+    np.testing.assert_allclose(second.translation, first.translation, atol=1e-4)
+    np.testing.assert_allclose(second.scale, first.scale, rtol=1e-4)
 
 
 def test_an_exported_query_has_the_whole_grid():
