@@ -20,8 +20,8 @@ from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
 # Compacted templates have a multiple of so many patches: each count is compiled anew, and most objects now share two.
 MULTIPLE = 64
 
-# XLA's options on a CPU that compile in about 60 % of the time what then takes a tenth longer; see
-# benchmarks/results/compiling.md. Rounding differs, as from one processor to another.
+# XLA's options on a CPU that compile in two thirds of the time what then takes about a twentieth longer, and rounds
+# otherwise (benchmarks/results/compiling.md). Lower levels of LLVM gain nothing at 1; at 0 queries take twice as long.
 QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False}
 
 
