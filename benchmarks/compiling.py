@@ -10,6 +10,7 @@ import dataclasses
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -28,7 +29,7 @@ from ipjax.networks.dinov2 import DinoV2, Encoder, find_preset
 from ipjax.synthetic import problems
 
 CHANNELS = 384
-OPTIONS = {
+OPTIONS: dict[str, dict[str, Any]] = {
     "as they are": {},
     "`inference.estimator.QUICK`": QUICK,
     "the same, LLVM at -O0": {**QUICK, "xla_backend_optimization_level": 0},
@@ -94,7 +95,8 @@ def tables() -> str:
     lines.append("|" + " --- |" * 8)
     before = [0.0, 0.0]
     jax.block_until_ready(jax.jit(jnp.sort)(jnp.arange(3)))  # what is done once in a process
-    for name, function, arguments in forms():
+    all_forms = list(forms())
+    for name, function, arguments in all_forms:
         cells = [name]
         for i, options in enumerate((None, QUICK)):
             took = measure(function, arguments, options)[0]
@@ -106,6 +108,7 @@ def tables() -> str:
         print(lines[-1], flush=True)
     lines += ["", "| the whole, XLA's options | both | clock | query | its clock | pose differs by |"]
     lines.append("|" + " --- |" * 6)
+    _, function, arguments = all_forms[-1]
     reference = None
     for name, options in OPTIONS.items():
         took, compiled = measure(function, arguments, options or None)
@@ -121,7 +124,7 @@ def tables() -> str:
 
 
 def main():
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.compiling", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.compiling", description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--page", type=Path, metavar="FILE", help="write the tables here")
     options = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)

@@ -305,11 +305,11 @@ def _draw_best(
     chosen, ahead = distinct(found.poses, found.score, count, config.score.apart)
     kept = jax.tree.map(lambda x: x[chosen], found)
     # Compiled for one platform, but traced for both: jitted, it is traced once.
-    rate = jax.jit(lambda one: score_drawn(encoder, templates, query, *one, config.score))
+    rate = jax.jit(lambda pose, undrawn: score_drawn(encoder, templates, query, pose, undrawn, config.score))
     with jax.named_scope("draw"):
         # One image at a time is fastest on a CPU; accelerators want them all.
         rated, agreement = lax.platform_dependent(
-            (kept.poses, kept.agreement), cpu=lambda x: lax.map(rate, x), default=jax.vmap(rate)
+            kept.poses, kept.agreement, cpu=lambda *x: lax.map(lambda one: rate(*one), x), default=jax.vmap(rate)
         )
     determined = kept.determined & ahead
     return _Candidates(kept.poses, determined, jnp.where(determined, rated, -1), agreement)

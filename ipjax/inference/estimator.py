@@ -22,7 +22,7 @@ MULTIPLE = 64
 
 # XLA's options on a CPU that compile in two thirds of the time what then takes about a twentieth longer, and rounds
 # otherwise (benchmarks/results/compiling.md). Lower levels of LLVM gain nothing at 1; at 0 queries take twice as long.
-QUICK: dict[str, bool | int | str] = {"xla_cpu_use_fusion_emitters": False}
+QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 
 
 @dataclasses.dataclass(frozen=True)
