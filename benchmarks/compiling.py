@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from flax import nnx
 
 from benchmarks.measure import commit, describe_device
-from benchmarks.queries import BLOCK, PRESET, Both
+from benchmarks.queries import BLOCK, PRESET, StandInWithDinov2
 from benchmarks.stages import front, match_only
 from ipjax.config import Config, RefineConfig, ScoreConfig
 from ipjax.estimation.pipeline import estimate
@@ -45,7 +45,8 @@ def forms():
     templates = compact(templates, multiple=MULTIPLE)
     query, _ = problems.make_query(0, grid=16, channels=CHANNELS, noise=0.3)
     key = jax.random.key(0)
-    encoder = Both(problems.make_encoder(CHANNELS), Encoder(DinoV2(find_preset(PRESET), rngs=nnx.Rngs(0)), BLOCK))
+    dinov2 = Encoder(DinoV2(find_preset(PRESET), rngs=nnx.Rngs(0)), BLOCK)
+    encoder = StandInWithDinov2(problems.make_encoder(CHANNELS), dinov2)
     plain = RefineConfig(steps=0, settle=False)
     yield "match", match_only, (templates, query, Config())
     yield "+ select, align", front, (templates, query, key, Config())
