@@ -20,8 +20,8 @@ from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
 # Compacted templates have a multiple of so many patches: each count is compiled anew, and most objects now share two.
 MULTIPLE = 64
 
-# XLA's options on a CPU that compile in two thirds of the time what then takes about a twentieth longer, and rounds
-# otherwise (benchmarks/results/compiling.md). Lower levels of LLVM gain nothing at 1; at 0 queries take twice as long.
+# XLA's options on a CPU that compile in two thirds of the time what then takes a twentieth to a tenth longer; rounding
+# differs (benchmarks/results/compiling.md). LLVM's level 1 gains nothing more; at level 0 queries take twice as long.
 QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
 
 
