@@ -93,6 +93,25 @@ def test_imports_inside_functions_count_and_those_of_type_checkers_do_not(tmp_pa
     assert list(list_executed("ipjax.a", packages={"ipjax": package})) == [f"ipjax.{name}" for name in "abce"]
 
 
+def test_a_package_that_offers_names_counts_with_their_modules(tmp_path):
+    package = tmp_path / "ipjax"
+    (package / "m").mkdir(parents=True)
+    (package / "__init__.py").write_text("from ipjax.c import z\n")
+    (package / "m" / "__init__.py").write_text(
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ipjax.m.x import f as f\n"
+    )
+    (package / "m" / "x.py").write_text("f = 1\n")
+    (package / "a.py").write_text("from ipjax import m\n")
+    (package / "b.py").write_text("from ipjax.m import f\n")
+    (package / "c.py").write_text("z = 1\n")
+    packages = {"ipjax": package}
+    for name in ("a", "b"):
+        assert list(list_executed(f"ipjax.{name}", packages=packages)) == [f"ipjax.{name}", "ipjax.m", "ipjax.m.x"]
+    assert list(list_executed("ipjax.m.x", packages=packages)) == ["ipjax.m.x"]
+    named = {name for name in list_executed("ipjax.bop.scoring.recalls") if name.startswith("ipjax.metrics.")}
+    assert {"ipjax.metrics.surface", "ipjax.metrics.visible", "ipjax.metrics.recalls"} <= named
+
+
 def test_results_hang_on_the_estimate(copies):
     executed = list_executed("ipjax.inference.estimator").keys()
     assert {

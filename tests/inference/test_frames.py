@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
-from PIL import Image
 
 from benchmarks.bias import frame_errors, summary
 from ipjax.files.cameras.intrinsics import Intrinsics
 from ipjax.files.cameras.reading import read_camera
 from ipjax.files.images.depth import read_depth
-from ipjax.files.images.masks import as_mask, read_mask
+from ipjax.files.images.masks import read_mask
 from ipjax.files.images.opening import read_rgb
 from ipjax.inference.depth import clean_depth
 from ipjax.inference.frames import frame, frame_turned
@@ -281,127 +280,6 @@ def test_bad_frames_are_refused_in_words(words, positional, named):
             frame(*positional, **named)
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
-
-
-ROS = """\
-image_width: 128
-image_height: 96
-camera_name: d435
-camera_matrix:
-  rows: 3
-  cols: 3
-  data: [110.0, 0.0, 63.2,
-         0.0, 108.0, 47.4, 0.0, 0.0, 1.0]
-distortion_model: plumb_bob
-distortion_coefficients:
-  rows: 1
-  cols: 5
-  data: [0.1, -0.2, 0.0, 0.0, 0.01]
-"""
-ECHO = "header:\n  frame_id: camera\nheight: 96\nwidth: 128\ndistortion_model: plumb_bob\nd:\n" + "".join(
-    f"- {x}\n" for x in (0.1, -0.2, 0.0, 0.0, 0.01)
-)
-ECHO += "k:\n" + "".join(f"- {x}\n" for x in K.reshape(-1)) + "r: [1, 0, 0]\n---\n"
-FLAT = K.reshape(-1).tolist()
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "lens", "scale"),
-    [
-        (
-            "scene_camera.json",
-            json.dumps({"3": {"cam_K": FLAT, "depth_scale": 0.1}, "4": {"cam_K": FLAT}}),
-            False,
-            1e-4,
-        ),
-        ("camera.json", json.dumps(dict(fx=110, fy=108, cx=63.2, cy=47.4, depth_scale=1.0)), False, 1e-3),
-        ("camera.txt", "110 108 63.2 47.4\n", False, None),
-        ("cam_K.txt", "\n".join(" ".join(map(str, row)) for row in K), False, None),
-        ("info.yaml", ROS, True, None),
-        ("echo.yaml", ECHO, True, None),
-        ("info.json", json.dumps(dict(K=FLAT, D=[0.1, -0.2, 0, 0, 0.01], distortion_model="plumb_bob")), True, None),
-        ("open3d.json", json.dumps(dict(intrinsic_matrix=K.T.reshape(-1).tolist(), width=128, height=96)), False, None),
-    ],
-)
-def test_cameras_are_read(tmp_path, name, text, lens, scale):
-    (tmp_path / name).write_text(text)
-    camera = read_camera(tmp_path / name, 3)
-    np.testing.assert_allclose(camera.matrix, K)
-    assert camera.distortion == ((0.1, -0.2, 0.0, 0.0, 0.01) if lens else ())
-    assert camera.depth_scale == (None if scale is None else pytest.approx(scale))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "empty"),
-        ("{", "not valid JSON"),
-        ("hello there", "neither"),
-        ("1 2 3", "3 numbers"),
-        ('{"a": 1}', "no camera among"),
-        ('{"1": {"cam_K": [1]}, "2": {}}', "say which one"),
-        (json.dumps({"cam_K": [0.0] * 8 + [1.0]}), "singular"),
-        (json.dumps({"cam_K": "abc"}), "numbers"),
-        (json.dumps({"K": FLAT, "D": [1, 2, 3], "distortion_model": "plumb_bob"}), "do not fit"),
-        (json.dumps({"K": FLAT, "D": [1], "distortion_model": "omni"}), "unknown lens"),
-        (json.dumps({"cam_K": FLAT, "depth_scale": 0}), "depth scale"),
-    ],
-)
-def test_bad_camera_files_are_refused_by_name(tmp_path, text, words):
-    path = tmp_path / "camera.file"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=words) as caught:
-        read_camera(path)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_images_are_read_as_they_were_taken(tmp_path):
-    rgb, depth, mask = scene()
-    Image.fromarray(rgb).save(tmp_path / "rgb.png")
-    np.testing.assert_array_equal(read_rgb(tmp_path / "rgb.png"), rgb)
-    for name, array in (
-        ("d.png", (depth * 1e3).astype(np.uint16)),
-        ("d.tif", depth),
-        ("e.tif", depth.astype(np.uint16)),
-    ):
-        Image.fromarray(array).save(tmp_path / name)
-        np.testing.assert_array_equal(read_depth(tmp_path / name), array)
-    np.save(tmp_path / "d.npy", depth)
-    np.testing.assert_array_equal(read_depth(tmp_path / "d.npy"), depth)
-    for name, array in (("m.png", mask), ("n.png", mask.astype(np.uint8)), ("o.png", mask.astype(np.uint8) * 255)):
-        Image.fromarray(array).save(tmp_path / name)
-        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
-    cut_out = np.dstack([rgb, mask.astype(np.uint8) * 255])
-    Image.fromarray(cut_out).save(tmp_path / "p.png")
-    np.testing.assert_array_equal(read_mask(tmp_path / "p.png"), mask)
-
-
-def test_bad_images_are_refused_by_name(tmp_path):
-    rgb, depth, _ = scene()
-    Image.fromarray(rgb).save(tmp_path / "rgb.png")
-    (tmp_path / "cut.png").write_bytes((tmp_path / "rgb.png").read_bytes()[:2000])
-    (tmp_path / "text.png").write_text("no image")
-    np.save(tmp_path / "flat.npy", depth[0])
-    (tmp_path / "cut.npy").write_bytes(b"\x93NUMPY")
-    np.save(tmp_path / "object.npy", np.array([{}], dtype=object), allow_pickle=True)
-    Image.fromarray((depth * 1000).astype(np.uint16)).save(tmp_path / "depth.png")
-    for read, name, words in [
-        (read_rgb, "none.png", "no such file"),
-        (read_rgb, "cut.png", "broken image"),
-        (read_rgb, "text.png", "not an image"),
-        (read_rgb, "depth.png", "is this the depth"),
-        (read_depth, "rgb.png", "16-bit or float"),
-        (read_depth, "flat.npy", "height × width"),
-        (read_depth, "cut.npy", "npy"),
-        (read_depth, "object.npy", "npy"),
-        (read_depth, "x.exr", "EXR"),
-        (read_mask, "text.png", "not an image"),
-    ]:
-        with pytest.raises(ValueError, match=words) as caught:
-            read(tmp_path / name)
-        assert name in str(caught.value) and "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match="not finite"):
-        as_mask(np.full((4, 4), np.nan))
 
 
 def test_a_real_frame(shared):

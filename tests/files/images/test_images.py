@@ -34,6 +34,58 @@ def labels() -> np.ndarray:
     return found
 
 
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_images_are_read_as_they_were_taken(tmp_path):
+    rgb, depth, mask = RGB, DEPTH, DISC
+    Image.fromarray(rgb).save(tmp_path / "rgb.png")
+    np.testing.assert_array_equal(read_rgb(tmp_path / "rgb.png"), rgb)
+    for name, array in (
+        ("d.png", (depth * 1e3).astype(np.uint16)),
+        ("d.tif", depth),
+        ("e.tif", depth.astype(np.uint16)),
+    ):
+        Image.fromarray(array).save(tmp_path / name)
+        np.testing.assert_array_equal(read_depth(tmp_path / name), array)
+    np.save(tmp_path / "d.npy", depth)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.npy"), depth)
+    for name, array in (("m.png", mask), ("n.png", mask.astype(np.uint8)), ("o.png", mask.astype(np.uint8) * 255)):
+        Image.fromarray(array).save(tmp_path / name)
+        np.testing.assert_array_equal(read_mask(tmp_path / name), mask)
+    cut_out = np.dstack([rgb, mask.astype(np.uint8) * 255])
+    Image.fromarray(cut_out).save(tmp_path / "p.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "p.png"), mask)
+
+
+def test_bad_images_are_refused_by_name(tmp_path):
+    rgb, depth = RGB, DEPTH
+    Image.fromarray(rgb).save(tmp_path / "rgb.png")
+    (tmp_path / "cut.png").write_bytes((tmp_path / "rgb.png").read_bytes()[:2000])
+    (tmp_path / "text.png").write_text("no image")
+    np.save(tmp_path / "flat.npy", depth[0])
+    (tmp_path / "cut.npy").write_bytes(b"\x93NUMPY")
+    np.save(tmp_path / "object.npy", np.array([{}], dtype=object), allow_pickle=True)
+    Image.fromarray((depth * 1000).astype(np.uint16)).save(tmp_path / "depth.png")
+    for read, name, words in [
+        (read_rgb, "none.png", "no such file"),
+        (read_rgb, "cut.png", "broken image"),
+        (read_rgb, "text.png", "not an image"),
+        (read_rgb, "depth.png", "is this the depth"),
+        (read_depth, "rgb.png", "16-bit or float"),
+        (read_depth, "flat.npy", "height × width"),
+        (read_depth, "cut.npy", "npy"),
+        (read_depth, "object.npy", "npy"),
+        (read_depth, "x.exr", "EXR"),
+        (read_mask, "text.png", "not an image"),
+    ]:
+        with pytest.raises(ValueError, match=words) as caught:
+            read(tmp_path / name)
+        assert name in str(caught.value) and "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="not finite"):
+        as_mask(np.full((4, 4), np.nan))
+
+
 # --- masks ------------------------------------------------------------------------------------------------------------
 
 
