@@ -27,6 +27,9 @@ def find_packages() -> dict[str, Path]:
 def list_executed(*modules: str, packages: Mapping[str, Path] | None = None) -> dict[str, Path]:
     """The files of modules and of all that they import, directly or not, within our packages; by module name.
 
+    A package that offers names of its modules, such as `ipjax.metrics`, counts with all of those modules where it is
+    imported itself; ``import ipjax`` does not, because no module may import the public names.
+
     Args:
         modules: dotted names, such as "ipjax.onboarding.mesh".
         packages: folders by package name; default: those that are running.
@@ -43,11 +46,17 @@ def list_executed(*modules: str, packages: Mapping[str, Path] | None = None) -> 
     while waiting:
         name = waiting.pop()
         path = _file_of(name, packages)
-        # The packages' own __init__ files hold names, and where to find them.
-        if name in found or path is None or path.name == "__init__.py":
+        if name in found or path is None:
             continue
-        found[name] = path
-        waiting += _imports(path)
+        if path.name != "__init__.py":
+            found[name] = path
+            waiting += _read_imports(path.read_bytes())
+        elif name not in packages:
+            # Its names come from modules that it imports when they are asked for; any of them may be.
+            homes = _read_imports(path.read_bytes(), for_types=True)
+            if homes:
+                found[name] = path
+                waiting += homes
     return dict(sorted(found.items()))
 
 
@@ -73,17 +82,14 @@ def _file_of(name: str, packages: Mapping[str, Path]) -> Path | None:
     return None
 
 
-def _imports(path: Path) -> list[str]:
-    return list(_read_imports(path.read_bytes()))
-
-
 @cache
-def _read_imports(source: bytes) -> tuple[str, ...]:
-    """Every name that may be a module which this source imports; what only type checkers see is left out."""
+def _read_imports(source: bytes, *, for_types: bool = False) -> tuple[str, ...]:
+    """Every name that may be a module which this source imports; what only type checkers see if ``for_types``."""
     found: list[str] = []
 
     def visit(node: ast.AST) -> None:
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        is_for_types = isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        if isinstance(node, ast.If) and is_for_types and not for_types:
             for other in node.orelse:
                 visit(other)
             return
