@@ -15,7 +15,8 @@ from ipjax.files.meshes.formats.stl import read_stl
 from ipjax.files.meshes.joining import join
 from ipjax.files.meshes.mesh import Mesh, make_mesh
 
-FORMATS = (".obj", ".ply", ".glb", ".gltf", ".stl")
+READERS = {".obj": read_obj, ".ply": read_ply, ".glb": read_gltf, ".gltf": read_gltf, ".stl": read_stl}
+FORMATS = tuple(READERS)
 
 
 def load_mesh(path: str | Path) -> Mesh:
@@ -34,9 +35,8 @@ def load_mesh(path: str | Path) -> Mesh:
     if size > MAX_BYTES:
         raise ValueError(f"{path.name} is {size / 1e9:.1f} GB; simplify the mesh first")
     source = Source(path)
-    readers = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, ".glb": read_gltf, ".gltf": read_gltf}
     try:
-        parts = [part for part in readers[kind](source) if len(part.faces)]
+        parts = [part for part in READERS[kind](source) if len(part.faces)]
         if not parts:
             raise ValueError("the mesh is empty: it has no faces (a point cloud must be meshed first)")
         joined = join(parts, source)
