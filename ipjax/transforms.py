@@ -35,6 +35,17 @@ class Similarity(eqx.Module, Generic[A]):
     translation: Float[A, "*b 3"]  # units of a
     scale: Float[A, "*b"]  # units of a per unit of b
 
+    __array_ufunc__ = None  # so that NumPy does not take a pose for an element of an array
+
+    def __init__(
+        self, rotation: Float[A, "*b 3 3"], translation: Float[A, "*b 3"], scale: Float[A, "*b"] | float | int
+    ):
+        """A pose of its parts; a scale that is Python's number becomes an array like the translation's."""
+        if isinstance(scale, int | float) and isinstance(translation, np.ndarray | jax.Array):
+            scale = _namespace(translation).asarray(scale, translation.dtype)
+        given: Any = scale
+        self.rotation, self.translation, self.scale = rotation, translation, given
+
     @overload
     def __matmul__(self, other: "Similarity[A]") -> "Similarity[A]": ...
 
@@ -46,6 +57,7 @@ class Similarity(eqx.Module, Generic[A]):
 
         Raises:
           ValueError: the points are not ``*b n 3``.
+          TypeError: they are no array.
         """
         if isinstance(other, Similarity):
             return Similarity(
@@ -53,6 +65,8 @@ class Similarity(eqx.Module, Generic[A]):
                 (self @ other.translation[..., None, :])[..., 0, :],
                 _array(self.scale * other.scale),
             )
+        if not hasattr(other, "ndim"):
+            return NotImplemented  # a list, or no points at all: Python says which two it cannot combine
         if other.ndim < 2 or other.shape[-1] != 3:
             raise ValueError(f"points are rows of 3, in an array of two axes or more, not {other.shape}")
         moved = _map(self.rotation, other)

@@ -276,3 +276,20 @@ def test_wrong_shapes_are_refused_in_words():
         retract(random_pose(0), jnp.zeros(5))
     with pytest.raises(ValueError, match="7 numbers"):
         Similarity.exp(jnp.zeros(8))
+
+
+def test_what_is_no_array_is_refused_in_words():
+    for pose in (random_pose(0), random_pose(0).to_numpy()):
+        with pytest.raises(TypeError, match="'Similarity' and 'list'"):
+            pose @ [[0.0, 0.0, 1.0]]
+        with pytest.raises(TypeError, match="'Similarity'"):
+            np.zeros((4, 3)) @ pose
+
+
+def test_a_scale_may_be_a_plain_number():
+    host = Similarity(np.eye(3), np.array([0.0, 0.0, 2.0]), 2.0)
+    assert isinstance(host.scale, np.ndarray) and host.scale.dtype == np.float64
+    np.testing.assert_array_equal((host.inverse() @ host).to_matrix(), np.eye(4))
+    graph = Similarity(jnp.eye(3), jnp.zeros(3), 1)
+    assert isinstance(graph.scale, jax.Array) and graph.scale.dtype == jnp.float32
+    assert (graph @ jnp.ones((2, 3))).dtype == jnp.float32
