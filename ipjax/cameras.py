@@ -134,22 +134,35 @@ def _cropping(first):
 
 
 def _resizing(before, after):
+    if min(*before, *after) <= 0:
+        raise ValueError(f"the sizes of images are positive, not {before} and {after}")
     zoom = np.asarray(after, np.float64) / np.asarray(before, np.float64)
     return zoom, 0.5 * zoom - 0.5  # the borders stay, at −½ and at the size less ½
 
 
 def _subsampling(step, first):
+    if np.min(step) <= 0:
+        raise ValueError(f"the step between pixels is positive, not {step}")
     zoom = 1 / np.broadcast_to(np.asarray(step, np.float64), 2)
     return zoom, -zoom * np.asarray(first, np.float64)
 
 
 def _move(pixels, zoom, shift):
+    pixels = _in_floats(pixels)
     return pixels * zoom.astype(pixels.dtype) + shift.astype(pixels.dtype)
+
+
+def _in_floats(values: Any) -> Any:
+    """Whole numbers, such as indices of pixels, as floats: half pixels have no place in them."""
+    if np.issubdtype(values.dtype, np.integer):
+        return values.astype(np.float64 if isinstance(values, np.ndarray) else jnp.float32)
+    return values
 
 
 def _change(camera: Any, zoom: np.ndarray, shift: np.ndarray) -> Any:
     if isinstance(camera, Camera):
-        return Camera(camera.focal * zoom.astype(camera.focal.dtype), _move(camera.centre, zoom, shift))
+        focal = _in_floats(camera.focal)
+        return Camera(focal * zoom.astype(focal.dtype), _move(camera.centre, zoom, shift))
     return np.array([[zoom[0], 0, shift[0]], [0, zoom[1], shift[1]], [0, 0, 1]]) @ camera
 
 

@@ -213,3 +213,21 @@ def test_a_mask_that_is_halved_grows_to_no_side():
             high.append(found[1] - wanted[1])
     assert abs(np.mean(low)) < 0.02 and abs(np.mean(high)) < 0.02
     assert np.mean(area) == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("xp", [np, jnp])
+def test_whole_pixels_and_whole_focal_lengths_do_not_lose_their_halves(xp):
+    pixels = xp.array([[10, 21]])
+    np.testing.assert_allclose(cameras.resize_pixels(pixels, (640, 480), (320, 240)), [[4.75, 10.25]])
+    np.testing.assert_allclose(cameras.subsample_pixels(pixels, 2, (1, 0)), [[4.5, 10.5]])
+    np.testing.assert_allclose(cameras.crop_pixels(pixels, (0.5, 2)), [[9.5, 19]])
+    whole = jax.tree.map(lambda x: x.astype(int), Camera(jnp.array([501.0, 500.0]), jnp.array([320.0, 240.0])))
+    seen = cameras.resize(whole, (640, 480), (320, 240))
+    np.testing.assert_allclose([seen.focal, seen.centre], [[250.5, 250], [159.75, 119.75]])
+
+
+def test_images_without_pixels_are_refused_in_words():
+    with pytest.raises(ValueError, match="sizes of images are positive"):
+        cameras.resize(K, (640, 480), (0, 240))
+    with pytest.raises(ValueError, match="step between pixels is positive"):
+        cameras.subsample(K, 0)
