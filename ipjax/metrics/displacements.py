@@ -4,7 +4,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from ipjax_kernels.positive import root
 from jaxtyping import Float
 
 from ipjax.records import Camera
@@ -48,7 +47,18 @@ def lengths(vectors: Float[A, "*b n"]) -> Float[A, "*b"]:
     if namespace(vectors) is np:
         found = np.asarray(np.linalg.norm(vectors, axis=-1))
     else:
-        found = root(jnp.sum(vectors**2, axis=-1))
+        found = square_root(jnp.sum(vectors**2, axis=-1))
+    return found
+
+
+def square_root(squares: Float[A, "*b"]) -> Float[A, "*b"]:
+    """Roots of sums of squares; in JAX the derivative at 0 is 0. NaN stays NaN: an absent pose is no perfect one."""
+    found: Any
+    if namespace(squares) is np:
+        found = np.asarray(np.sqrt(squares))
+    else:
+        zero = squares == 0
+        found = jnp.where(zero, 0, jnp.sqrt(jnp.where(zero, 1, squares)))
     return found
 
 

@@ -12,12 +12,14 @@ ADD_LIMIT = 0.1  # metres: where the area under the accuracy-threshold curve of 
 
 def recall(errors: Float[Array, "*b n"], thresholds: Float[Array, "t"]) -> Float[Array, "*b t"]:
     """Share of errors strictly below each threshold; NaN and infinity are misses. 0 for no errors at all."""
+    errors = jnp.asarray(errors)
     below = errors[..., None, :] < thresholds[:, None]
     return jnp.sum(below, axis=-1).astype(errors.dtype) / max(errors.shape[-1], 1)
 
 
 def average_recall(errors: Float[Array, "*b n"], thresholds: Float[Array, "t"] | None = None) -> Float[Array, "*b"]:
     """Mean of the recalls at several thresholds (BOP's ten, in diameters, when None), in [0, 1]."""
+    errors = jnp.asarray(errors)
     chosen = jnp.asarray(THRESHOLDS if thresholds is None else thresholds, errors.dtype)
     return jnp.mean(recall(errors, chosen), axis=-1)
 
@@ -28,6 +30,7 @@ def area_under_accuracy(errors: Float[Array, "n"], limit: float = ADD_LIMIT) -> 
     Errors beyond the limit, and infinite ones, are misses. As in PoseCNN's toolbox (Xiang et al. 2018), the curve
     takes its higher value between two errors. Same unit for errors and limit; 0 for no errors at all.
     """
+    errors = jnp.asarray(errors)
     count = errors.shape[0]
     if count == 0:
         return jnp.zeros((), errors.dtype)

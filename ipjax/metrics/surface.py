@@ -20,6 +20,7 @@ from ipjax.metrics.displacements import (
     lengths,
     namespace,
     pixel_displacements,
+    square_root,
 )
 from ipjax.metrics.poses import scale_error
 from ipjax.records import Camera
@@ -34,7 +35,7 @@ def surface_distance(points: Float[A, "n 3"], truth: Similarity[A], estimate: Si
     """
     xp = namespace(points, truth.translation, estimate.translation)
     moved = displacements(points, truth, estimate)
-    return xp.asarray(xp.sqrt(xp.max(xp.sum(moved**2, axis=-1), axis=-1)))
+    return square_root(xp.max(xp.sum(moved**2, axis=-1), axis=-1))
 
 
 def projection_distance(
@@ -47,7 +48,7 @@ def projection_distance(
     needed: the distance of two perspective projections is not convex in x. The camera is K for NumPy's arrays."""
     xp = namespace(points, truth.translation, estimate.translation)
     moved = pixel_displacements(points, camera, truth, estimate)
-    return xp.asarray(xp.sqrt(xp.max(xp.sum(moved**2, axis=-1), axis=-1)))
+    return square_root(xp.max(xp.sum(moved**2, axis=-1), axis=-1))
 
 
 def mssd(
@@ -86,8 +87,14 @@ def closest_symmetry(
     Exact branch and bound: the maximum over a few extreme vertices bounds each symmetry from below; symmetries are
     then tried, ``block`` at a time and most promising first, until the next bound is no better than the best value.
     """
+    # NumPy's arrays cannot be indexed inside the loop.
+    points, symmetries, truth, estimate, camera = jax.tree.map(
+        jnp.asarray, (points, symmetries, truth, estimate, camera)
+    )
     _require_axis(symmetries.translation, 1, "symmetries")
     count = symmetries.translation.shape[0]
+    if count == 0:
+        raise ValueError("symmetries must have one at least, the identity")
     block = min(block, count)
     alike = truth @ symmetries  # [s]
 
@@ -141,10 +148,11 @@ def projections_overlap(diameter: float | Float[A, ""], truth: Similarity[A], es
     return xp.asarray((depths[0] != 0) & (depths[1] != 0) & (apart < diameter / 2 * (1 / safe[0] + 1 / safe[1])))
 
 
-def add(points: Float[A, "n 3"], truth: Similarity[A], estimate: Similarity[A]) -> Float[A, ""]:
-    """Average distance of the vertices in the true and the estimated pose (Hinterstoisser et al. 2012)."""
+def add(points: Float[A, "n 3"], truth: Similarity[A], estimate: Similarity[A]) -> Float[A, "*b"]:
+    """Average distance of the vertices in the true and the estimated pose (Hinterstoisser et al. 2012). Leading axes of
+    the poses broadcast."""
     xp = namespace(points, truth.translation, estimate.translation)
-    return xp.asarray(xp.mean(lengths(displacements(points, truth, estimate))))
+    return xp.asarray(xp.mean(lengths(displacements(points, truth, estimate)), axis=-1))
 
 
 def add_s(
@@ -165,6 +173,8 @@ def add_s(
             the host the query of a k-d tree of ``points``.
     """
     xp = namespace(points, truth.translation, estimate.translation)
+    if truth.translation.ndim != 1 or estimate.translation.ndim != 1:
+        raise ValueError("ADD-S compares one pose with one: jax.vmap does many")
     # In the estimated object's frame one of the two sets is the model itself, and equal poses give exactly x.
     back = xp.swapaxes(estimate.rotation, -1, -2)
     inside = points + apply_matrix(back, displacements(points, estimate, truth)) / estimate.scale
@@ -177,10 +187,10 @@ def reprojection_error(
     camera: Camera | Float[np.ndarray, "3 3"],
     truth: Similarity[A],
     estimate: Similarity[A],
-) -> Float[A, ""]:
-    """Average distance of the projected vertices, pixels (BOP's ``proj``; no symmetries)."""
+) -> Float[A, "*b"]:
+    """Average distance of the projected vertices, pixels (BOP's ``proj``; no symmetries). Leading axes broadcast."""
     xp = namespace(points, truth.translation, estimate.translation)
-    return xp.asarray(xp.mean(lengths(pixel_displacements(points, camera, truth, estimate))))
+    return xp.asarray(xp.mean(lengths(pixel_displacements(points, camera, truth, estimate)), axis=-1))
 
 
 class SizedErrors(eqx.Module):

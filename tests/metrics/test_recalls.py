@@ -44,3 +44,10 @@ def test_the_size_is_right_strictly_within_its_tolerance():
     np.testing.assert_allclose(
         metrics.recall(found, jnp.asarray(metrics.SIZE_TOLERANCES, jnp.float32)), [0.4, 0.6, 0.8]
     )
+
+
+def test_recalls_of_doubles_on_the_host():
+    # NumPy's doubles and lists come from anybody's files; warnings are errors here.
+    for errors in (np.array([0.1, 0.3, np.inf, np.nan]), [0.1, 0.3, np.inf, np.nan]):
+        assert metrics.average_recall.__wrapped__(errors) == pytest.approx(0.3)
+    assert metrics.area_under_accuracy.__wrapped__(np.array([0.01, 0.05])) == pytest.approx(0.95)

@@ -156,3 +156,40 @@ def test_shapes_are_named():
     said = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
     assert "one shape" in said
     assert "symmetries must have 1 leading axis" in said
+
+
+def test_an_absent_pose_is_no_perfect_one():
+    points, truth = jnp.asarray(POINTS), random_pose(0)
+    absent = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), truth)
+    assert np.isnan(metrics.add(points, truth, absent)) and np.isnan(metrics.surface_distance(points, truth, absent))
+    assert np.isnan(metrics.translation_error(truth.translation, absent.translation))
+    assert not metrics.spheres_overlap(1.0, truth, absent)
+
+
+def test_errors_have_a_derivative_where_they_are_nothing():
+    points, truth = jnp.asarray(POINTS), random_pose(0)
+    for error in (
+        lambda pose: metrics.mssd(points, NONE, truth, pose),
+        lambda pose: metrics.mspd(points, NONE, CAMERA, truth, pose),
+    ):
+        assert all(np.isfinite(x).all() for x in jax.tree.leaves(jax.grad(error)(truth)))
+
+
+def test_many_poses_have_an_error_each_or_are_refused():
+    points, truth = np.asarray(POINTS, np.float64), random_pose(0).to_numpy()
+    many = jax.tree.map(lambda *x: np.stack(x), truth, random_pose(1).to_numpy())
+    found = metrics.add(points, truth, many)
+    assert found.shape == (2,) and found[0] == 0 and found[1] == metrics.add(points, truth, random_pose(1).to_numpy())
+    with pytest.raises(ValueError, match=r"jax\.vmap"):
+        metrics.add_s(points, truth, many)
+
+
+def test_symmetries_are_searched_from_numpys_arrays_too():
+    turns, places = metrics.discretise_symmetries([], [(np.array([0, 0, 1.0]), np.zeros(3))], step=0.1)
+    host = Similarity(turns.astype(np.float32), places.astype(np.float32), np.ones(len(turns), np.float32))
+    points, one, other = np.asarray(POINTS), random_pose(0), random_pose(1)
+    as_numpy = [jax.tree.map(np.asarray, pose) for pose in (one, other)]
+    found, _ = metrics.closest_symmetry.__wrapped__(points, host, *as_numpy)
+    np.testing.assert_allclose(found, metrics.mssd(jnp.asarray(points), host.to_jax(), one, other), rtol=1e-6)
+    with pytest.raises(ValueError, match="one at least"):
+        metrics.mssd(jnp.asarray(points), Similarity.identity((0,)), one, other)
