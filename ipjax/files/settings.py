@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import json
 import math
 import types
 import typing
@@ -32,7 +33,7 @@ def read_config(name: str | Path, changes: Iterable[str] = ()) -> Config:
         raise ValueError(f"{name}: neither {', '.join(PRESETS)} nor a file of settings")
     entry = read_json(path, "file of settings")
     if not isinstance(entry, dict):
-        raise ValueError(f"{path}: settings are a JSON object, like {{'match': {{'views': 4}}}}")
+        raise ValueError(f'{path}: settings are a JSON object, like {{"match": {{"views": 4}}}}')
     start = entry.pop("from", "default")
     if start not in PRESETS:
         raise ValueError(f"{path}: 'from' is one of {', '.join(PRESETS)}, not {start!r}")
@@ -159,7 +160,7 @@ def _replace_fields(config: Any, entry: Mapping[str, Any], where: str) -> Any:
             changed[name] = _convert(value, known[name], old)
             if changed[name] is _INVALID:
                 raise ValueError(
-                    f"{where}: {name} is {_as_text(old)} by default; {_as_text(value)} is of another kind: "
+                    f"{where}: {name} is {_as_text(old)} by default; {json.dumps(value)} is of another kind: "
                     f"{_describe_kind(known[name], old)} is expected"
                 )
     return dataclasses.replace(config, **changed)

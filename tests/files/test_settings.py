@@ -27,7 +27,8 @@ def test_settings_from_a_file(tmp_path):
         ('{"align": {"size": 2}}', "a whole number from 3 is expected"),
         ('{"match": {"cycle": 1%s}}' % ("0" * 400), "a number is expected"),
         ('{"from": "nowhere"}', "'from' is one of default, fast, paper, not 'nowhere'"),
-        ("[1]", "a JSON object"),
+        ("[1]", 'a JSON object, like {"match": {"views": 4}}'),
+        ('{"match": {"views": [true, null]}}', "[true, null] is of another kind"),
         ("{", "not valid JSON"),
     ):
         path.write_text(text)
