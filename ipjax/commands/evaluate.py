@@ -124,8 +124,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
 
 def _method(arguments: argparse.Namespace) -> str:
     """What the results are called: all that was not the default, in words that a file name may have."""
-    parts = ["ipjax", Path(arguments.config).stem]
-    parts += [re.sub(r"[^\w.]+", "-", change) for change in arguments.changes]
+    chosen = (Path(arguments.config).stem, *arguments.changes)
+    parts = ["ipjax", *(re.sub(r"[^\w.]+", "-", words) for words in chosen)]
     if arguments.mesh_quality:
         parts.append(f"level{arguments.mesh_quality}")
     if arguments.known_size:

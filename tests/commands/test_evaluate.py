@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 from builders.bop_roots import write_ellipsoids
 
+from ipjax import cli
+from ipjax.commands import evaluate as evaluate_command
+
 HERE = Path(__file__).resolve().parents[1]
 VIEWS = ["--directions", "6", "--rolls", "4"]
 SETTINGS = {
@@ -60,6 +63,12 @@ def place(tmp_path_factory) -> Path:
 def evaluate(place: Path, out: str, *more, **how) -> subprocess.Popen:
     words = ["ipjax", "evaluate", place / "balls", "--objects", place / "objects", "-o", place / out]
     return start(*words, "--config", place / "quick.json", "--quiet", *VIEWS, *more, **how)
+
+
+def test_results_are_named_in_words_that_a_file_name_may_have():
+    words = ["evaluate", "data", "-o", "out", "--config", "my settings, new.json", "--set", "align.scale_gate=0.5, 2"]
+    name = evaluate_command._method(cli.build_parser().parse_args([*words, "--known-size"]))
+    assert name == "ipjax-my-settings-new-align.scale_gate-0.5-2-known-size"
 
 
 @pytest.fixture(scope="module")
