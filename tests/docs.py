@@ -59,8 +59,9 @@ def build_api(folder: Path) -> list[str]:
 
     import ipjax
 
-    for name in ipjax.__all__:  # imported when first asked for; pdoc looks at what is there
-        setattr(ipjax, name, getattr(ipjax, name))
+    for package in (ipjax, ipjax.metrics):  # their names are imported when first asked for; pdoc looks at what is there
+        for name in package.__all__:
+            setattr(package, name, getattr(package, name))
     ipjax.__doc__ = f"{ipjax.__doc__}\n\n{list_guides()}"
     names = [
         module.name
@@ -68,16 +69,17 @@ def build_api(folder: Path) -> list[str]:
         for module in pkgutil.walk_packages(package.__path__, package.__name__ + ".")
         if module.name not in NO_MODULES
     ]
-    # pdoc takes the modules of a package along, but not those of ipjax itself, which lists its public names.
-    tops = [name for name in names if name.startswith("ipjax.") and name.count(".") == 1]
+    # pdoc takes the modules of a package along, but not those of packages that list their public names.
+    tops = [name for name in names if name.rpartition(".")[0] in ("ipjax", "ipjax.metrics")]
     pdoc.render.configure(docformat="google", search=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         pdoc.pdoc("ipjax", "ipjax_kernels", *tops, output_directory=folder)
     missing = [name for name in names if not (folder / f"{name.replace('.', '/')}.html").is_file()]
-    text = (folder / "ipjax.html").read_text()
-    missing += [f"ipjax.{name}" for name in ipjax.__all__ if f'id="{name}"' not in text]
+    for package in (ipjax, ipjax.metrics):
+        text = (folder / f"{package.__name__.replace('.', '/')}.html").read_text()
+        missing += [f"{package.__name__}.{name}" for name in package.__all__ if f'id="{name}"' not in text]
     for name in names:  # what a module declares and does not hide
         page = (folder / f"{name.replace('.', '/')}.html").read_text() if name not in missing else ""
         for key, value in vars(importlib.import_module(name)).items():

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import ipjax
+import ipjax.metrics
 
 BUILDER = Path(__file__).with_name("docs.py")
 
@@ -16,6 +17,8 @@ def test_every_public_name_and_guide_has_a_page(tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
     text = (folder / "ipjax.html").read_text()
     assert all(f'id="{name}"' in text for name in ipjax.__all__)
+    errors = (folder / "ipjax/metrics.html").read_text()
+    assert all(f'id="{name}"' in errors for name in ipjax.metrics.__all__)
     for guide in ("README.html", "CHANGELOG.html", "notebooks/4_pose.html", "benchmarks/results/accuracy.html"):
         assert (folder / "guide" / guide).is_file() and f"{guide}" in text + (folder / "guide/README.html").read_text()
 

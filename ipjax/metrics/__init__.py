@@ -47,6 +47,40 @@ if TYPE_CHECKING:
     from ipjax.metrics.visible import visibility as visibility
     from ipjax.metrics.visible import vsd as vsd
 
+__all__ = [
+    "ADD_LIMIT",
+    "PIXEL_THRESHOLDS",
+    "SIZE_TOLERANCES",
+    "SYMMETRY_STEP",
+    "THRESHOLDS",
+    "SizedErrors",
+    "add",
+    "add_s",
+    "area_under_accuracy",
+    "average_precision",
+    "average_recall",
+    "closest_symmetry",
+    "detection_precision",
+    "discretise_symmetries",
+    "distances_from_camera",
+    "match_poses",
+    "mspd",
+    "mssd",
+    "projection_distance",
+    "projections_overlap",
+    "recall",
+    "reprojection_error",
+    "rotation_error",
+    "scale_error",
+    "sized_errors",
+    "spheres_overlap",
+    "surface_distance",
+    "translation_error",
+    "turn_angle",
+    "visibility",
+    "vsd",
+]
+
 # Where each of them is.
 _HOMES = {
     "poses": (
