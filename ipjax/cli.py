@@ -19,7 +19,7 @@ from ipjax.commands.interface import completion
 from ipjax.commands.interface.messages import Messages, in_one_line, is_user_error
 from ipjax.commands.interface.parser import Parser
 
-COMMANDS = (onboard, estimate, demo, doctor, weights, score, evaluate, degrade, export)  # as --help lists them
+_COMMANDS = (onboard, estimate, demo, doctor, weights, score, evaluate, degrade, export)  # as --help lists them
 GUIDE = """\
 start here:
   ipjax doctor                               what works on this machine
@@ -70,7 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"ipjax {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True, parser_class=Parser)
-    for command in COMMANDS:
+    for command in _COMMANDS:
         command.add(commands)
     return parser
 

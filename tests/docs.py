@@ -41,7 +41,8 @@ img {{ max-width: 100%; }} a {{ color: #0550ae; }}
 def build(folder: Path) -> list[str]:
     """Write all pages; returns the names of the modules documented.
 
-    Raises RuntimeError where a public name has no page or a link leads nowhere, and whatever pdoc warns of.
+    Raises RuntimeError where a public name has no page, a link leads nowhere, or a page has a path of this machine; and
+    whatever pdoc warns of.
     """
     os.environ.setdefault("MUJOCO_GL", "disable")  # nothing is drawn, and pdoc keeps MuJoCo from looking for a display
     shutil.rmtree(folder, ignore_errors=True)
@@ -88,6 +89,9 @@ def build_api(folder: Path) -> list[str]:
             )
             if declared and not key.startswith("_") and f'id="{key}"' not in page:
                 missing.append(f"{name}.{key}")
+    local = [str(page.relative_to(folder)) for page in sorted(folder.rglob("*.html")) if str(ROOT) in page.read_text()]
+    if local:
+        raise RuntimeError(f"a path of this machine stands in {', '.join(local)}")
     if missing:
         raise RuntimeError(f"no page tells of {', '.join(missing)}")
     return names
