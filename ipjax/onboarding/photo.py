@@ -17,16 +17,15 @@ from ipjax.files.images.depth import read_depth, remove_sentinel
 from ipjax.files.images.masks import read_mask
 from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.objects.saving import save
-from ipjax.files.weights.catalogue import WeightsError
 from ipjax.files.weights.hashes import hash_file
 from ipjax.inference.cutting import undistort_frame
 from ipjax.inference.depth import check_depth_unit, find_depth_scale, sample_depth, to_metres
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo
 from ipjax.onboarding.mesh import onboard
-from ipjax.onboarding.reconstruction.reconstruct import reconstruct
-from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
-from ipjax.onboarding.reconstruction.triposr import load_triposr, resolve_triposr
+from ipjax.onboarding.reconstruction.methods import METHODS
+from ipjax.onboarding.reconstruction.reconstruct import reconstruct_with_weights
+from ipjax.onboarding.reconstruction.result import Reconstruction
 from ipjax.records import Camera, Templates
 
 log = logging.getLogger("ipjax")
@@ -97,7 +96,14 @@ def onboard_photo(
     prepared = prepare_photo(
         source, mask=mask, box=box, click=click, depth=depth, camera=camera, depth_scale=depth_scale, tried=tried
     )
-    made, method = _reconstruct(prepared, lrm, lrm_weights, _print_progress if progress else None)
+    made, method = reconstruct_with_weights(
+        prepared.foreground,
+        method=lrm,
+        weights=lrm_weights,
+        depth=prepared.depth,
+        camera=prepared.camera,
+        progress=_print_progress if progress else None,
+    )
     path = None if isinstance(source, Photo) else Path(source)
     name = name or (path.stem if path else "object")
     templates, info = onboard(made.mesh, encoder, config, name=name, progress=progress, backend=backend)
@@ -216,28 +222,6 @@ def _to_metres(
     return to_metres(depth, unit)
 
 
-def _reconstruct(
-    prepared: PreparedPhoto, lrm: str, weights: str | Path | None, progress: Progress | None
-) -> tuple[Reconstruction, str]:
-    """The mesh, and the method that made it: "triposr", "depth" or "inflate"."""
-    if lrm not in ("auto", "triposr", "inflate"):
-        raise ValueError(f"the reconstruction is 'auto', 'triposr' or 'inflate', not {lrm!r}")
-    model, missing = None, ""
-    if lrm == "triposr" or (lrm == "auto" and prepared.depth is None):
-        try:
-            model = load_triposr(resolve_triposr(weights).path)
-        except WeightsError:
-            if lrm == "triposr" or weights is not None:
-                raise
-            missing = "TripoSR's weights are not here, so the mesh was made without learned weights"
-    made = reconstruct(
-        prepared.foreground, method=lrm, depth=prepared.depth, camera=prepared.camera, model=model, progress=progress
-    )
-    if missing:
-        made = dataclasses.replace(made, report=(*made.report, missing))
-    return made, "triposr" if model is not None else "depth" if prepared.depth is not None else "inflate"
-
-
 def _print_progress(stage: str, share: float) -> None:
     print(f"\rreconstructing: {stage} {share:.0%}  ", end="\n" if share >= 1 else "", flush=True)
 
@@ -270,7 +254,7 @@ def _describe(
         focal=(float(focal[0]), float(focal[1])),
         centre=(float(centre[0]), float(centre[1])),
         size=(int(width), int(height)),
-        camera_given=prepared.camera is not None and method != "triposr",
+        camera_given=prepared.camera is not None and METHODS[method].keeps_camera,
         metric=made.metric,
         method=method,
         seen=float(np.asarray(templates.surface.seen).mean()),

@@ -23,6 +23,7 @@ from ipjax.inference.reports import CONVENTIONS, relative_pose, relative_pose_as
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.onboarding import photo as photos
 from ipjax.onboarding.foreground import Photo
+from ipjax.onboarding.reconstruction.reconstruct import reconstruct_with_weights
 from ipjax.onboarding.report import findings
 from ipjax.onboarding.report.page import write_report
 from ipjax.records import Similarity
@@ -189,7 +190,8 @@ def test_triposr_without_weights_is_refused_but_auto_goes_on(encoder, monkeypatc
     rgb, mask, _ = ball()
     with pytest.raises(ValueError, match="weights of TripoSR are not here"):
         photos.onboard_photo(Photo(rgb), encoder, CONFIG, mask=mask, lrm="triposr", progress=False)
-    made, method = photos._reconstruct(photos.prepare_photo(Photo(rgb), mask=mask), "auto", None, None)
+    prepared = photos.prepare_photo(Photo(rgb), mask=mask)
+    made, method = reconstruct_with_weights(prepared.foreground)
     assert method == "inflate" and not made.metric
     assert any("TripoSR's weights are not here" in line for line in made.report)
 

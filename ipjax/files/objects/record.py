@@ -21,7 +21,7 @@ class Reference:
         focal, centre, size: of the photo's camera, given or assumed; pixels of the photo as it was read.
         camera_given: the user gave the camera; else it was assumed.
         metric: the photo had depth, so the mesh is in metres and its size was measured.
-        method: how the mesh was made: "depth", "inflate" or "triposr".
+        method: how the mesh was made: a name in `METHODS` of the reconstruction, such as "inflate".
         seen: share of the surface that the photo shows; the rest is guessed.
         picture: a small JPEG of the photo; None = not kept.
     """

@@ -1,11 +1,14 @@
 """From one photo to a mesh, and where the photo's camera stood: the method that fits what is known of the photo."""
 
 import dataclasses
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
+from ipjax.files.weights.catalogue import WeightsError
+from ipjax.onboarding.reconstruction.methods import CHOICES
 from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
 from ipjax.records import Camera
 
@@ -39,7 +42,7 @@ def reconstruct(
     from ipjax.onboarding.reconstruction.inflation import inflate_photo
     from ipjax.onboarding.reconstruction.triposr import reconstruct_with_triposr
 
-    if method not in ("auto", "triposr", "inflate"):
+    if method not in CHOICES:
         raise ValueError(f"the method is 'auto', 'triposr' or 'inflate', not {method!r}")
     if depth is not None and camera is None:
         raise ValueError("depth without its camera has no metric points: give the camera too")
@@ -56,3 +59,37 @@ def reconstruct(
     else:
         made = inflate_photo(foreground.rgb, foreground.mask, camera=camera)
     return dataclasses.replace(made, report=notes + made.report)
+
+
+def reconstruct_with_weights(
+    foreground: "Foreground",
+    *,
+    method: str = "auto",
+    weights: str | Path | None = None,
+    depth: Float[np.ndarray, "h w"] | None = None,
+    camera: Camera | None = None,
+    progress: Progress | None = None,
+) -> tuple[Reconstruction, str]:
+    """`reconstruct` with the model that the method needs, and the name in `METHODS` of the one that made the mesh.
+
+    Args:
+        weights: the checkpoint; default: the one that is here. Where "auto" finds none, the mesh is made without.
+
+    Raises ValueError as `reconstruct`; WeightsError where weights were asked for and are not here.
+    """
+    from ipjax.onboarding.reconstruction.triposr import load_triposr, resolve_triposr
+
+    if method not in CHOICES:
+        raise ValueError(f"the reconstruction is 'auto', 'triposr' or 'inflate', not {method!r}")
+    model, missing = None, ""
+    if method == "triposr" or (method == "auto" and depth is None):
+        try:
+            model = load_triposr(resolve_triposr(weights).path)
+        except WeightsError:
+            if method == "triposr" or weights is not None:
+                raise
+            missing = "TripoSR's weights are not here, so the mesh was made without learned weights"
+    made = reconstruct(foreground, method=method, depth=depth, camera=camera, model=model, progress=progress)
+    if missing:
+        made = dataclasses.replace(made, report=(*made.report, missing))
+    return made, "triposr" if model is not None else "depth" if depth is not None else "inflate"

@@ -15,6 +15,7 @@ from ipjax.files.weights.downloading import download_file
 from ipjax.files.weights.finding import is_offline
 from ipjax.files.weights.hashes import cached_hash
 from ipjax.files.weights.local import Resolved
+from ipjax.onboarding.reconstruction.methods import METHODS
 from ipjax.onboarding.reconstruction.result import Progress, Reconstruction
 from ipjax.records import Camera, Similarity
 
@@ -27,7 +28,7 @@ TRIPOSR = Source(
     "triposr",
     "triposr",
     "triposr_5b521936_model.ckpt",
-    "MIT",
+    METHODS["triposr"].licence,
     "429e2c6b22a0923967459de24d67f05962b235f79cde6b032aa7ed2ffcd970ee",
     url="https://huggingface.co/stabilityai/TripoSR/resolve/5b521936b01fbe1890f6f9baed0254ab6351c04a/model.ckpt",
 )

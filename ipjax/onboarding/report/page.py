@@ -10,6 +10,7 @@ from ipjax.files.meshes.mesh import Mesh
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.pages import embed_image, render_page
 from ipjax.files.storage.writing import write_text
+from ipjax.onboarding.reconstruction.methods import METHODS
 from ipjax.onboarding.report.findings import STEPS, Findings, name_axis
 from ipjax.onboarding.report.pictures import (
     GUESSED,
@@ -93,12 +94,8 @@ def _describe_source(info: ObjectInfo) -> str:
     source = info.mesh_file or "a mesh"
     if info.reference is None:
         return f"made from {source}"
-    method = {
-        "depth": "its front measured by the depth image, its back guessed",
-        "inflate": "its outline inflated without learned weights",
-        "triposr": "reconstructed by TripoSR",
-    }.get(info.reference.method, info.reference.method)
-    return f"made from one photo, {source}: {method}"
+    method = METHODS.get(info.reference.method)
+    return f"made from one photo, {source}: {method.description if method else info.reference.method}"
 
 
 def _list_facts(templates: Templates, info: ObjectInfo, found: Findings) -> list[tuple[str, str]]:
@@ -126,15 +123,14 @@ def _list_facts(templates: Templates, info: ObjectInfo, found: Findings) -> list
 def _list_licences(info: ObjectInfo) -> list[tuple[str, str]]:
     """Names and values, of the weights that made the object."""
     from ipjax.files.weights.catalogue import CATALOGUE
-    from ipjax.onboarding.reconstruction.triposr import TRIPOSR
 
     digest = info.encoder.rpartition("sha256:")[2]
     source = next((one for one in CATALOGUE.values() if one.sha256 == digest), None)
     licence = source.licence if source else "licence unknown: not a file of the catalogue (DINOv2 itself is Apache-2.0)"
     rows = [("encoder", f"{source.name + ', ' if source else ''}{licence}"), ("", info.encoder)]
     if info.reference is not None:
-        made = f"TripoSR, {TRIPOSR.licence}" if info.reference.method == "triposr" else "no learned weights"
-        rows.append(("reconstruction", made))
+        method = METHODS.get(info.reference.method)
+        rows.append(("reconstruction", method.describe_weights() if method else "no learned weights"))
     return rows
 
 
