@@ -35,6 +35,7 @@ class Contour(eqx.Module):
 
     points: Float[Array, "b 2"]  # (column, row)
     outward: Float[Array, "b 2"]  # unit normals
+    bend: Float[Array, "b"]  # curvature, 1 / cells; positive where the object is convex
     valid: Bool[Array, "b"]
 
 
@@ -48,7 +49,8 @@ def trace_contour(
 
     Args:
       cover: the share of each cell that the object covers, or a mask. The border runs where it is one half, found
-        between cells: on either axis, so that its points are off to neither side whatever its direction.
+        between cells: on either axis, so that its points are off to neither side whatever its direction. Where it is
+        curved, they are moved by as much as the mean over a cell, and the line between two, cut off a bend.
       depth: metres, 0 = unknown. What is by ``nearer`` before the object's depth beside it cuts the object: the border
         is its own there, and left out, as is the border of the image.
       count: where the whole border is shorter, the remaining points are not valid.
@@ -75,11 +77,17 @@ def trace_contour(
     smooth = jnp.sum(jnp.stack([w * smooth[:, i : i + width + 2] for i, w in enumerate(binomial)]), axis=0)
     slope = jnp.stack([smooth[1:-1, :-2] - smooth[1:-1, 2:], smooth[:-2, 1:-1] - smooth[2:, 1:-1]], axis=-1)
 
+    # The curvature of the lines of one share is the divergence of their normals.
+    across, down = jnp.moveaxis(slope / jnp.sqrt(jnp.sum(slope**2, axis=-1, keepdims=True) + 1e-12), -1, 0)
+    across, down = jnp.pad(across, ((0, 0), (1, 1)), mode="edge"), jnp.pad(down, ((1, 1), (0, 0)), mode="edge")
+    bend = jnp.clip((across[:, 2:] - across[:, :-2] + down[2:] - down[:-2]) / 2, -0.5, 0.5)
+
     row, column = np.mgrid[:height, :width]
     cell = np.stack([column, row], axis=-1)
 
     def crossings(axis):
-        """The border between each cell and the next: where, its slope, a rank that is 0 where there is none."""
+        """The border between each cell and the next: where, its normal and curvature, how far in it lies for each unit
+        of curvature, and a rank that is 0 where there is none."""
         here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 0 else (np.s_[:-1], np.s_[1:])
         crosses = mask[here] != mask[there]
         change = cover[here] - cover[there]
@@ -89,13 +97,19 @@ def trace_contour(
         kept = crosses & ~jnp.where(mask[here], cut[here], cut[there])
         # A fixed shuffle: neighbours lie far apart.
         spread = ((row * 7919 + column * 104729 + axis * 2011) % 4093).astype(np.int32)[here]
-        return place, slope[here] + slope[there], jnp.where(kept, spread + 1, 0)
+        # A bend of curvature k lies k v / 2 farther in where it is blurred with variance v along it. A cell blurs with
+        # 1 / 12, and the line between two cells with share (1 - share), as far as it runs along the border.
+        normal = slope[here] + slope[there]
+        askew = 1 - normal[..., axis] ** 2 / (jnp.sum(normal**2, axis=-1) + 1e-12)
+        loss = 1 / 24 + askew * share * (1 - share) / 2
+        return place, normal, (bend[here] + bend[there]) / 2, loss, jnp.where(kept, spread + 1, 0)
 
     flat = lambda first, second: jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in (first, second)])
-    place, slope, rank = (flat(*both) for both in zip(crossings(0), crossings(1), strict=True))
+    *found, rank = (flat(*both) for both in zip(crossings(0), crossings(1), strict=True))
     rank, chosen = lax.top_k(rank, min(count, rank.shape[0]))
-    outward = slope[chosen] / jnp.sqrt(jnp.sum(slope[chosen] ** 2, axis=-1, keepdims=True) + 1e-12)
-    return Contour(place[chosen], outward, rank > 0)
+    place, normal, bend, loss = (x[chosen] for x in found)
+    outward = normal / jnp.sqrt(jnp.sum(normal**2, axis=-1, keepdims=True) + 1e-12)
+    return Contour(place + (bend * loss)[:, None] * outward, outward, bend, rank > 0)
 
 
 class Cloud(eqx.Module):
@@ -425,8 +439,13 @@ def _place(moved, points, normals):
     """Points and normals in the camera frame, and which of them show it their front."""
     placed = moved @ points
     facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
-    seen = lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -0.1 * jnp.linalg.norm(placed, axis=-1))
+    seen = lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -_GRAZING * jnp.linalg.norm(placed, axis=-1))
     return placed, facing, seen
+
+
+# Least cosine at which surface is seen to be compared. What is about to turn away projects beside the mask as soon as
+# the object is a little too large, where a point costs the most it can: objects would come out too small.
+_GRAZING = 0.3
 
 
 def _depth_terms(moved, unit, points, normals, trust, cloud, config):
@@ -460,7 +479,8 @@ def _silhouette(moved, unit, points, cloud, config):
     """Geman–McClure on how far the object's silhouette is from the mask's border, along the border's normal.
 
     The silhouette there is the surface point that reaches farthest out in a strip across the border, so that no mesh
-    is needed; where the strip is empty the cost is the maximum.
+    is needed, and where it lies beside the strip's middle, by as much farther as the border bends until there; where
+    the strip is empty the cost is the maximum.
     """
     contour, camera = cloud.contour, cloud.camera
     focal = jnp.mean(camera.focal)
@@ -468,11 +488,14 @@ def _silhouette(moved, unit, points, cloud, config):
     normal = contour.outward[:, None]
     along = jnp.sum(offset * normal, axis=-1)
     across = offset[..., 0] * normal[..., 1] - offset[..., 1] * normal[..., 0]
+    along = along + contour.bend[:, None] * across**2 / 2
     reach = lax.stop_gradient(config.silhouette_reach * unit * focal / jnp.maximum(moved.translation[2], 1e-6))
     strip = (jnp.abs(across) < 1) & (jnp.abs(along) < reach)
     farthest = lax.argmax(jnp.where(strip, along, -jnp.inf), 1, jnp.int32)
     placed = moved @ points[farthest]
-    gap = jnp.sum((project(camera, placed) - contour.points) * contour.outward, axis=-1)
+    offset, normal = project(camera, placed) - contour.points, contour.outward
+    beside = offset[:, 0] * normal[:, 1] - offset[:, 1] * normal[:, 0]
+    gap = jnp.sum(offset * normal, axis=-1) + contour.bend * beside**2 / 2
     squared = (gap * placed[:, 2] / focal / (config.silhouette_width * unit)) ** 2
     cost = jnp.where(jnp.any(strip, axis=1), jnp.sqrt(squared / (1 + squared) + 1e-12), 1.0)
     return _averaged(jnp.where(contour.valid, cost, 0), jnp.sum(contour.valid))
