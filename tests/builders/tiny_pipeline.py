@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 import ipjax
+from benchmarks.bias import rotation_error
 from ipjax.config import AlignConfig, Config, MatchConfig, RefineConfig, ScoreConfig
 from ipjax.records import Similarity
 from ipjax.synthetic import problems
@@ -48,3 +49,10 @@ def make_sized_query(seed: int, diameter: float):
     sized = lambda q: (q.patches.points, q.view.depth)
     query = eqx.tree_at(sized, query, jax.tree.map(lambda x: x * factor, sized(query)))
     return query, Similarity(truth.rotation, truth.translation * factor, truth.scale * factor)
+
+
+def assert_near(found, truth, diameters, share, degrees):
+    """Its centre within so many diameters, its scale within a share, its rotation within degrees."""
+    assert float(jnp.linalg.norm(found.translation - truth.translation)) < diameters * float(truth.scale)
+    assert abs(float(found.scale / truth.scale) - 1) < share
+    assert rotation_error(found, truth) < degrees

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders.tiny_pipeline import DRAWN, TINY, TRACES, TURNED, estimate, make_sized_query, two_objects
+from builders.tiny_pipeline import DRAWN, TINY, TRACES, TURNED, assert_near, estimate, make_sized_query, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ipjax
-from benchmarks.bias import pose_errors, summary
+from benchmarks.bias import pose_errors, rotation_error, summary
 from ipjax.config import Config, MatchConfig, ScoreConfig
 from ipjax.estimation.features import cut, principal_basis
 from ipjax.estimation.pipeline import comparable, distinct
@@ -25,24 +25,10 @@ def templates():
     return problems.make_templates()
 
 
-def rotation_error(one: Similarity, other: Similarity) -> float:
-    """Degrees, up to the ellipsoid's own symmetries: half-turns about its axes."""
-    relative = np.asarray(one.rotation, np.float64).T @ np.asarray(other.rotation, np.float64)
-    turns = [np.diag(s) for s in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]
-    return min(np.degrees(np.arccos(np.clip((np.trace(relative @ t) - 1) / 2, -1, 1))) for t in turns)
-
-
 def same(one, other, tolerance):
     assert rotation_error(one, other) < np.degrees(tolerance)
     np.testing.assert_allclose(one.translation, other.translation, atol=tolerance)
     np.testing.assert_allclose(one.scale, other.scale, rtol=tolerance)
-
-
-def assert_near(found, truth, diameters, share, degrees):
-    """Its centre within so many diameters, its scale within a share, its rotation within degrees."""
-    assert float(jnp.linalg.norm(found.translation - truth.translation)) < diameters * float(truth.scale)
-    assert abs(float(found.scale / truth.scale) - 1) < share
-    assert rotation_error(found, truth) < degrees
 
 
 def gather_errors(found_and_true):
