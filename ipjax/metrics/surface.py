@@ -35,7 +35,7 @@ def surface_distance(points: Float[A, "n 3"], truth: Similarity[A], estimate: Si
     """
     xp = namespace(points, truth.translation, estimate.translation)
     moved = displacements(points, truth, estimate)
-    return square_root(xp.max(xp.sum(moved**2, axis=-1), axis=-1))
+    return square_root(xp.asarray(xp.max(xp.sum(moved**2, axis=-1), axis=-1)))
 
 
 def projection_distance(
@@ -48,7 +48,7 @@ def projection_distance(
     needed: the distance of two perspective projections is not convex in x. The camera is K for NumPy's arrays."""
     xp = namespace(points, truth.translation, estimate.translation)
     moved = pixel_displacements(points, camera, truth, estimate)
-    return square_root(xp.max(xp.sum(moved**2, axis=-1), axis=-1))
+    return square_root(xp.asarray(xp.max(xp.sum(moved**2, axis=-1), axis=-1)))
 
 
 def mssd(
