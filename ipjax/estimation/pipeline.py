@@ -15,9 +15,11 @@ from ipjax.cameras import mask_from_coverage, resize
 from ipjax.config import Config
 from ipjax.estimation.alignment import align
 from ipjax.estimation.confidence import covariance, find_rival, pair_information, probability, rotation_ambiguity
+from ipjax.estimation.contour import trace_contour
 from ipjax.estimation.features import identity_of, lift, object_features
 from ipjax.estimation.matching import match, select
-from ipjax.estimation.refinement import Cloud, information, refine, settle, trace_contour
+from ipjax.estimation.refinement import information, refine, settle
+from ipjax.estimation.residuals import Cloud
 from ipjax.estimation.scoring import score, score_drawn, seen_share
 from ipjax.estimation.validity import finite_estimate, finite_query, finite_templates
 from ipjax.metrics.poses import turn_angle

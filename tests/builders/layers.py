@@ -12,7 +12,8 @@ ORDER = [
     ["ipjax.cameras"],
     ["ipjax.metrics", "ipjax.networks"],
     # The graph. Its stages do not import one another.
-    ["ipjax.estimation", "ipjax.estimation.validity"],
+    ["ipjax.estimation", "ipjax.estimation.validity", "ipjax.estimation.contour"],
+    ["ipjax.estimation.residuals"],
     [f"ipjax.estimation.{s}" for s in ("features", "matching", "alignment", "refinement", "scoring", "confidence")],
     ["ipjax.estimation.pipeline"],
     # What cannot be jitted.

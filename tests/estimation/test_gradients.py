@@ -16,8 +16,10 @@ from ipjax_kernels.positive import invert_semidefinite, root
 
 import ipjax
 from ipjax.config import RefineConfig
+from ipjax.estimation.contour import trace_contour
 from ipjax.estimation.features import lift
-from ipjax.estimation.refinement import Cloud, refine, settle, trace_contour
+from ipjax.estimation.refinement import refine, settle
+from ipjax.estimation.residuals import Cloud
 from ipjax.metrics.poses import turn_angle
 from ipjax.records import Camera, Pairs
 from ipjax.synthetic import problems

@@ -11,18 +11,11 @@ from hypothesis import strategies as st
 
 from benchmarks.bias import contour_errors, pose_errors, summary
 from ipjax.config import RefineConfig
+from ipjax.estimation.contour import trace_contour
 from ipjax.estimation.features import observe
 from ipjax.estimation.pipeline import SceneGrid
-from ipjax.estimation.refinement import (
-    Cloud,
-    _linearise,
-    _nearest_visible,
-    refine,
-    settle,
-    strained,
-    trace_contour,
-    unevenness,
-)
+from ipjax.estimation.refinement import refine, settle, unevenness
+from ipjax.estimation.residuals import Cloud, linearise, nearest_visible, strained
 from ipjax.inference.frames import frame
 from ipjax.records import Pairs
 from ipjax.synthetic import problems
@@ -163,10 +156,10 @@ def test_widths_fixed_in_metres_do_not_reward_growth(scene):
     bumpy = uneven(surface, 0, 0.03)
     units = truth.scale, 0 * truth.scale
     fixed, relative = (
-        np.asarray(_linearise(truth, grown, bumpy, cloud, None, CONFIG, unit, rigid=7)[0]) for unit in units
+        np.asarray(linearise(truth, grown, bumpy, cloud, None, unit, CONFIG, rigid=7)[0]) for unit in units
     )
     assert np.sum(fixed**2) > 1.02 * np.sum(relative**2)
-    there = [_linearise(truth, 0 * grown, bumpy, cloud, None, CONFIG, unit, rigid=7)[0] for unit in units]
+    there = [linearise(truth, 0 * grown, bumpy, cloud, None, unit, CONFIG, rigid=7)[0] for unit in units]
     np.testing.assert_array_equal(*there)  # at the start both are the same
 
 
@@ -321,7 +314,7 @@ def test_what_is_hidden_does_not_count(scene, side):
     assert float(jnp.linalg.norm(found.translation - truth.translation)) < 0.03 * float(truth.scale)
 
 
-NEAREST = jax.jit(_nearest_visible)
+NEAREST = jax.jit(nearest_visible)
 
 
 @given(seed=st.integers(0, 2**31), share=st.sampled_from([0.0, 0.3, 1.0]))
