@@ -149,5 +149,6 @@ def check_links(folder: Path) -> None:
 
 
 if __name__ == "__main__":
+    sys.path[:0] = [str(ROOT), str(ROOT / "kernels")]  # this tree, whichever one is installed
     target = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / "out" / "docs")
     print(f"{len(build(target))} modules: {target / 'index.html'}")
