@@ -31,12 +31,13 @@ def trace_contour(
     Args:
       cover: the share of each cell that the object covers, or a mask. The border runs where it is one half, found
         between cells: on either axis, so that its points are off to neither side whatever its direction. Where it is
-        curved, they are moved by as much as the mean over a cell, and the line between two, cut off a bend.
+        curved, they are moved by as much as a share's mean over a cell, and the line between two, cut off a bend.
       depth: metres, 0 = unknown. What is by ``nearer`` before the object's depth beside it cuts the object: the border
         is its own there, and left out, as is the border of the image.
       count: where the whole border is shorter, the remaining points are not valid.
     """
     height, width = cover.shape
+    blurred = cover.dtype != jnp.bool_
     cover = cover.astype(depth.dtype)
     mask = mask_from_coverage(cover)
     reach = 2  # cells that the normals are smoothed over, and that occluders are looked for in
@@ -79,10 +80,11 @@ def trace_contour(
         # A fixed shuffle: neighbours lie far apart.
         spread = ((row * 7919 + column * 104729 + axis * 2011) % 4093).astype(np.int32)[here]
         # A bend of curvature k lies k v / 2 farther in where it is blurred with variance v along it. A cell blurs with
-        # 1 / 12, and the line between two cells with share (1 - share), as far as it runs along the border.
+        # 1 / 12, and the line between two cells with share (1 - share), as far as it runs along the border. Nothing is
+        # blurred in a mask of yes and no.
         normal = slope[here] + slope[there]
         askew = 1 - normal[..., axis] ** 2 / (jnp.sum(normal**2, axis=-1) + 1e-12)
-        loss = 1 / 24 + askew * share * (1 - share) / 2
+        loss = 1 / 24 + askew * share * (1 - share) / 2 if blurred else jnp.zeros_like(share)
         return place, normal, (bend[here] + bend[there]) / 2, loss, jnp.where(kept, spread + 1, 0)
 
     flat = lambda first, second: jnp.concatenate([x.reshape(-1, *x.shape[2:]) for x in (first, second)])

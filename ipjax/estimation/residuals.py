@@ -156,12 +156,16 @@ def place_surface(
     """Points and normals in the camera frame, and which of them show it their front."""
     placed = moved @ points
     facing = jnp.sum(moved.rotation[None] * normals[:, None, :], axis=-1)
-    seen = lax.stop_gradient(jnp.sum(facing * placed, axis=-1) < -_GRAZING * jnp.linalg.norm(placed, axis=-1))
-    return placed, facing, seen
+    return placed, facing, _faces_camera(placed, facing, 0.1)
 
 
-# Least cosine at which surface is seen to be compared. What is about to turn away projects beside the mask as soon as
-# the object is a little too large, where a point costs the most it can: objects would come out too small.
+def _faces_camera(placed, normals, cosine):
+    """Whether the surface shows the camera its front, at an angle to the ray of this cosine at least."""
+    return lax.stop_gradient(jnp.sum(normals * placed, axis=-1) < -cosine * jnp.linalg.norm(placed, axis=-1))
+
+
+# Least cosine at which a surface point must have been measured. One about to turn away projects beside the mask as soon
+# as the object is a little too large, and costs the most a point can: objects would come out too small.
 _GRAZING = 0.3
 
 
@@ -176,15 +180,16 @@ def _depth_terms(moved, unit, points, normals, trust, cloud, config):
     # Surface that faces away, lies behind an occluder, or falls into a hole of the depth image cannot have been
     # measured and costs nothing.
     nearer = (cloud.depth[row, column] > 0) & (cloud.depth[row, column] < placed[:, 2] - config.reach * unit / 2)
-    counted = visible & ~lax.stop_gradient(jnp.where(on_mask, ~measured, nearer))
+    steady = _faces_camera(placed, facing, _GRAZING)
+    counted = steady & ~lax.stop_gradient(jnp.where(on_mask, ~measured, nearer))
     forward = jnp.where(counted, forward, 0)
     targets = cloud.points[::2, ::2].reshape(-1, 3)
     known = cloud.valid[::2, ::2].reshape(-1)
     nearest = lax.stop_gradient(nearest_visible(targets, placed, visible))
     backward = _robust(placed[nearest] - targets, facing[nearest], known, unit, config)
     backward = jnp.where(known, backward * jnp.sqrt(trust[nearest]), 0)
-    # At least a third of the visible points count: else a pose whose points are mostly occluded would cost little.
-    count = jnp.maximum(jnp.sum(counted), jnp.sum(visible) // 3)
+    # At least a third of the points count: else a pose whose points are mostly occluded would cost little.
+    count = jnp.maximum(jnp.sum(counted), jnp.sum(steady) // 3)
     return _averaged(forward, lax.stop_gradient(count)), _averaged(backward, jnp.sum(known))
 
 

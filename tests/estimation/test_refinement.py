@@ -163,17 +163,25 @@ def test_widths_fixed_in_metres_do_not_reward_growth(scene):
     np.testing.assert_array_equal(*there)  # at the start both are the same
 
 
-def test_what_is_right_is_left_alone(scene):
-    """On an even surface of the right proportions the last step does what one more refinement would."""
-    surface, cloud, truth = scene
-    fitted, cost = run(surface, cloud, truth, CONFIG)
-    wrong_pairs = Pairs(surface.points[:512], truth @ surface.points[:512] + 0.1 * truth.scale, jnp.ones(512))
-    settled = run_settle(surface, cloud, fitted, wrong_pairs, CONFIG)
-    again, _ = run(surface, cloud, fitted, CONFIG)
-    moved = jnp.linalg.norm(settled @ surface.points - again @ surface.points, axis=-1) / truth.scale
-    assert float(moved.max()) < 2e-3
-    still = jax.jit(refine)(surface, cloud, settled, dataclasses.replace(CONFIG, steps=0))[1]
-    assert float(still) <= float(cost) + 1e-5
+def test_what_is_right_is_left_alone():
+    """On an even surface of the right proportions the last step does what one more refinement would.
+
+    Most of the way: along a valley as flat as the size's against the distance, either may go on by thousandths.
+    """
+    surface, apart = problems.make_surface(2048), []
+    for seed in range(8):
+        query, truth = problems.make_query(seed)
+        cloud = reduced(query)
+        fitted, cost = run(surface, cloud, truth, CONFIG)
+        wrong_pairs = Pairs(surface.points[:512], truth @ surface.points[:512] + 0.1 * truth.scale, jnp.ones(512))
+        settled = run_settle(surface, cloud, fitted, wrong_pairs, CONFIG)
+        again, _ = run(surface, cloud, fitted, CONFIG)
+        moved = jnp.linalg.norm(settled @ surface.points - again @ surface.points, axis=-1) / truth.scale
+        apart.append(float(moved.max()))
+        still = run(surface, cloud, settled, dataclasses.replace(CONFIG, steps=0))[1]
+        assert float(still) <= float(cost) + 1e-5
+    assert np.median(apart) < 1e-3, apart
+    assert max(apart) < 5e-3, apart
 
 
 def uneven(surface, seed: int, amplitude: float):
