@@ -146,20 +146,24 @@ def slopes(templates, query, share):
 def test_confidence_follows_the_features(templates):
     """To 5 %, through the compiled estimate; noise in the features moves the confidence, not the pose.
 
-    On a scene where nothing that is chosen changes within the step, as two differences that agree show; where four
-    steps of refinement do not reach the minimum, the derivative is up to a tenth off.
+    On every scene where nothing that is chosen changes within the steps, as differences over two of them agree; where
+    confidence hardly moves, float32 does not resolve the differences.
     """
-    query, _ = problems.make_query(4, noise=0.3)
-    noise = jnp.asarray(np.random.default_rng(0).normal(size=query.patches.features.shape), jnp.float32)
+    compared = []
+    for seed in range(16):
+        query, _ = problems.make_query(seed, noise=0.3)
+        noise = jnp.asarray(np.random.default_rng(0).normal(size=query.patches.features.shape), jnp.float32)
 
-    def sure(amount):
-        moved = eqx.tree_at(lambda q: q.patches.features, query, query.patches.features + amount * noise)
-        return float(estimate(templates, moved, jax.random.key(0), TINY).confidence)
+        def sure(amount, query=query, noise=noise):
+            moved = eqx.tree_at(lambda q: q.patches.features, query, query.patches.features + amount * noise)
+            return float(estimate(templates, moved, jax.random.key(0), TINY).confidence)
 
-    derivative = float(jnp.sum(slopes(templates, query, jnp.zeros(()))[1].patches.features * noise))
-    half, whole = ((sure(step) - sure(-step)) / (2 * step) for step in (1e-3, 2e-3))
-    assert abs(whole) > 1e-3 and half == pytest.approx(whole, rel=0.05)
-    assert derivative == pytest.approx(whole, rel=0.05)
+        half, whole = ((sure(step) - sure(-step)) / (2 * step) for step in (5e-4, 1e-3))
+        if abs(whole) > 4e-3 and half == pytest.approx(whole, rel=0.03):
+            derivative = float(jnp.sum(slopes(templates, query, jnp.zeros(()))[1].patches.features * noise))
+            assert derivative == pytest.approx(whole, rel=0.05), seed
+            compared.append(seed)
+    assert len(compared) >= 2
 
 
 def test_slopes_are_finite_everywhere(templates):
