@@ -47,6 +47,22 @@ def test_recovers_pose_and_size(templates, seed):
     assert_near(found.camera_from_object, truth, 0.12, 0.15, 20)
 
 
+def test_the_default_compilation_has_the_same_answer(templates):
+    """Tests compile with XLA's older emitters on a CPU (see conftest.py), users with its default ones."""
+    default = jax.jit(
+        lambda *records: ipjax.estimate(None, *records, jax.random.key(0), TINY),
+        compiler_options={"xla_cpu_use_fusion_emitters": True},
+    )
+    for seed in range(3):
+        query, truth = problems.make_query(seed)
+        found, other = default(templates, query), estimate(templates, query, jax.random.key(0), TINY)
+        assert_near(found.camera_from_object, truth, 0.12, 0.15, 20)
+        np.testing.assert_allclose(found.camera_from_object.rotation, other.camera_from_object.rotation, atol=1e-3)
+        np.testing.assert_allclose(
+            found.camera_from_object.translation, other.camera_from_object.translation, atol=1e-4
+        )
+
+
 def test_estimates_are_off_to_no_side(templates):
     """From the whole image on: signed errors within three standard errors of zero, unsigned ones as small as reached.
 
