@@ -141,7 +141,7 @@ def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = P
             name, mesh = scans[turn // 2 % len(scans)]
         else:
             kind = KINDS[turn // 2 % len(KINDS)] if scans else KINDS[turn % len(KINDS)]
-            name, mesh = f"{kind}-{turn}", make_object(kind, 1000 + turn)
+            name, mesh = f"{kind}-{turn}", make_object(kind, 100_000 * seed + 1000 + turn)
         other = make_object(KINDS[(turn + 3) % len(KINDS)], 2000 + turn)
         size, other_size = (float(x) for x in rng.uniform(0.09, 0.22, 2))
         queries = []

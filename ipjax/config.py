@@ -85,6 +85,25 @@ class ScoreConfig(eqx.Module):
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
 
 
+class ResectConfig(eqx.Module):
+    """From a photo without depth to its camera among the query's points (``estimation.resection``)."""
+
+    views: int = _static(12, least=1)  # of the object whose pairs are kept
+    pairs: int = _static(256, least=3)  # most pairs of each
+    count: int = _static(1024, least=1)  # minimal sets of each
+    keep: int = _static(4, least=1)  # hypotheses of each
+    apart: float = 0.21  # rad (12°): hypotheses closer than this count as one
+    threshold: float = 0.06  # of an inlier, in diagonals of the photo's outline
+    width: float = 0.03  # of the robust loss, likewise
+    scale_gate: tuple[float, float] = (0.45, 2.2)  # around the size that the areas of both outlines tell
+    steps: int = _static(10)  # of Gauss and Newton
+    drawn: int = _static(8, least=1)  # hypotheses of all views that are drawn
+    rounds: int = _static(2)  # in which what is drawn is matched again
+    window: float = 3.0  # patches in which it is
+    softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
+    cover: float = 0.3  # least share of a patch that must be drawn
+
+
 class ConfidenceConfig(eqx.Module):
     """From agreement to a probability and a covariance; most of it fitted by ``python -m benchmarks.calibration``."""
 
@@ -102,6 +121,7 @@ class Config(eqx.Module):
     match: MatchConfig = MatchConfig()
     align: AlignConfig = AlignConfig()
     refine: RefineConfig = RefineConfig()
+    resect: ResectConfig = ResectConfig()
     score: ScoreConfig = ScoreConfig()
     confidence: ConfidenceConfig = ConfidenceConfig()
 

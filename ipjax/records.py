@@ -73,6 +73,18 @@ class Appearance(eqx.Module):
     colours: Float[Array, "*b m 3"]  # [0, 1]
 
 
+class ReferenceView(eqx.Module):
+    """The photo without depth that an object was made from: its colours and directions are true, its depth is a guess.
+
+    A patch of it and a patch of the query, whose depth was measured, are a ray of the photo's camera and a point in
+    space: with enough of them the photo's camera is found, and with it the object, whatever its guessed shape.
+    """
+
+    view: View  # a crop that looks at the object, the rest black; depth in model units, guessed by the reconstruction
+    patches: Patches  # of that view: features centred as the templates' are, points in the object frame
+    camera_from_object: Similarity  # scale 1, model units
+
+
 class Templates(eqx.Module):
     """An onboarded object: rendered views as patches, their poses, and its surface.
 
@@ -91,6 +103,7 @@ class Templates(eqx.Module):
     axes: Float[Array, "*b 3 3"]  # rows: unit axes of the smallest box around the object, about which it may look alike
     basis: Float[Array, "*b f c"] | None = None  # rows: the principal directions that features were cut to
     appearance: Appearance | None = None  # with it and the encoder, candidates are drawn and compared
+    reference: ReferenceView | None = None  # of an object from a photo without depth: its pose is found through it
 
 
 class Query(eqx.Module):

@@ -23,9 +23,10 @@ from ipjax.files.objects.saving import save
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.files.weights.hashes import hash_file
 from ipjax.networks.dinov2 import Encoder
+from ipjax.onboarding.photo_views import PhotoSource, ReferencePhoto, photo_poses, put_photo
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.progress import bar
-from ipjax.records import Appearance, Camera, Patches, Similarity, Surface, Templates, View
+from ipjax.records import Appearance, Camera, Patches, ReferenceView, Similarity, Surface, Templates, View
 from ipjax.rendering.render import render
 
 _CORNERS = 3000  # of a convex hull, among which its smallest box is sought
@@ -101,10 +102,14 @@ def make_templates(
     encoder: Encoder,
     config: OnboardConfig = OnboardConfig(),
     *,
+    photo: PhotoSource | None = None,
     progress: bool = True,
     backend: str = "auto",
 ) -> tuple[Templates, UInt8[np.ndarray, "v h w 3"]]:
     """Render and describe a normalised mesh.
+
+    Args:
+      photo: the one without depth that the mesh was made from; its views follow the others.
 
     Returns:
       The templates, and their images ``[v resolution resolution 3]`` uint8 for pictures.
@@ -118,10 +123,15 @@ def make_templates(
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
     axes = box_axes(mesh.vertices[used])  # first: it refuses what has no shape
-    poses = viewpoints(config.directions, config.rolls, distance=config.distance)
+    poses, first = viewpoints(config.directions, config.rolls, distance=config.distance), 0
+    if photo is not None:
+        first = len(poses.scale)
+        poses = jax.tree.map(lambda *x: jnp.concatenate(x), poses, photo_poses(photo).to_jax())
     cameras = framing_cameras(mesh.vertices, poses, config.resolution, config.fill)
     views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)
     views = dataclasses.replace(views, camera=jax.tree.map(np.asarray, cameras))
+    if photo is not None:
+        views = put_photo(views, photo, poses.to_numpy(), first)
     surface = Surface(*(jnp.asarray(x, jnp.float32) for x in sample_surface(mesh, config.surface, seed=0)))
     poses_on_host = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
 
@@ -156,6 +166,7 @@ def make_templates(
         features, kept = jax.jit(cut)(patches.features, basis)
         patches = dataclasses.replace(patches, features=features.astype(patches.features.dtype))
         norm = norm * kept
+    at_photo = lambda tree: jax.tree.map(lambda x: x[first], tree)
     templates = Templates(
         patches=patches,
         basis=basis,
@@ -168,6 +179,18 @@ def make_templates(
         extents=jnp.asarray(np.ptp(mesh.vertices, axis=0), jnp.float32),
         axes=jnp.asarray(axes, jnp.float32),
         appearance=make_appearance(mesh, config.appearance) if config.appearance else None,
+        reference=None
+        if photo is None
+        else ReferenceView(
+            view=View(
+                rgb=jnp.asarray(views.rgb[first].astype(np.float32) / 255),
+                depth=jnp.asarray(views.depth[first]),
+                mask=jnp.asarray(views.mask[first]),
+                camera=at_photo(cameras),
+            ),
+            patches=at_photo(patches),
+            camera_from_object=at_photo(poses),
+        ),
     )
     return templates, views.rgb
 
@@ -197,6 +220,7 @@ def onboard(
     out: str | Path | None = None,
     name: str | None = None,
     metres_per_unit: float | None = None,
+    reference: ReferencePhoto | None = None,
     progress: bool = True,
     backend: str = "auto",
 ) -> tuple[Templates, ObjectInfo]:
@@ -208,6 +232,7 @@ def onboard(
       out: also write the object file.
       name: default: the file's.
       metres_per_unit: the mesh file's unit, where it is known; then the object's size is, too.
+      reference: the photo without depth that the mesh was made from: poses are found through it.
       backend: the renderer: ``auto``, ``egl``, ``osmesa``, ``native`` or ``raster``.
 
     Raises:
@@ -218,7 +243,8 @@ def onboard(
     mesh = source if isinstance(source, Mesh) else load_mesh(source)
     mesh, repairs = clean(mesh)
     mesh = normalise(mesh)
-    templates, pictures = make_templates(mesh, encoder, config, progress=progress, backend=backend)
+    photo = None if reference is None else reference.of_normalised(mesh)
+    templates, pictures = make_templates(mesh, encoder, config, photo=photo, progress=progress, backend=backend)
     textured = None if mesh.texture is None or mesh.uv is None else (mesh.texture, mesh.uv)
     info = ObjectInfo(
         name=name or (path.stem if path else "object"),

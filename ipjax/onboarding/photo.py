@@ -23,6 +23,7 @@ from ipjax.inference.depth import check_depth_unit, find_depth_scale, sample_dep
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo
 from ipjax.onboarding.mesh import onboard
+from ipjax.onboarding.photo_views import ReferencePhoto
 from ipjax.onboarding.reconstruction.methods import METHODS
 from ipjax.onboarding.reconstruction.reconstruct import reconstruct_with_weights
 from ipjax.onboarding.reconstruction.result import Reconstruction
@@ -106,7 +107,13 @@ def onboard_photo(
     )
     path = None if isinstance(source, Photo) else Path(source)
     name = name or (path.stem if path else "object")
-    templates, info = onboard(made.mesh, encoder, config, name=name, progress=progress, backend=backend)
+    reference = None
+    if prepared.depth is None and made.camera_from_mesh is not None and made.camera is not None:
+        shown = prepared.foreground
+        reference = ReferencePhoto(shown.rgb, shown.mask, made.camera_from_mesh, made.camera)
+    templates, info = onboard(
+        made.mesh, encoder, config, name=name, reference=reference, progress=progress, backend=backend
+    )
     info = dataclasses.replace(
         info,
         mesh_file=path.name if path else "",

@@ -44,29 +44,31 @@ def splat_depth(
 @functools.partial(jax.jit, static_argnames=("height", "width"))
 def splat_colours(
     points: Float[Array, "n 3"],
-    colours: Float[Array, "n 3"],
+    colours: Float[Array, "n c"],
     valid: Bool[Array, " n"],
     focal: Float[Array, "2"],
     centre: Float[Array, "2"],
     height: int,
     width: int,
     behind: Float[Array, ""] | float,
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+) -> tuple[Float[Array, "h w c"], Float[Array, "h w"]]:
     """Image and depth of coloured points in the camera frame; black and 0 where nothing is.
 
     A pixel has the mean colour of its points that lie at most `behind` behind the nearest one in a 3 × 3 square; a
-    pixel without any, the mean of its neighbours'. Meant for several points per pixel. Otherwise as `splat_depth`.
+    pixel without any, the mean of its neighbours'. Meant for several points per pixel. Colours are any numbers that are
+    to be averaged so. Otherwise as `splat_depth`.
     """
     depth = splat_depth(points, valid, focal, centre, height, width)
     place = _pixels(points, valid, focal, centre, height, width)
     nearest = depth.reshape(-1).at[place].get(mode="fill", fill_value=-jnp.inf)
     shown = jnp.where(points[:, 2] <= nearest + behind, place, height * width)
     paint = jnp.concatenate([colours, jnp.ones_like(colours[:, :1])], axis=-1)
-    sums = jnp.zeros((height * width, 4), colours.dtype).at[shown].add(paint, mode="drop").reshape(height, width, 4)
+    sums = jnp.zeros((height * width, paint.shape[1]), colours.dtype).at[shown].add(paint, mode="drop")
+    sums = sums.reshape(height, width, -1)
     padded = jnp.pad(sums, ((1, 1), (1, 1), (0, 0)))
     around = sum(padded[i : i + height, j : j + width] for i in range(3) for j in range(3))
-    chosen = jnp.where(sums[..., 3:] > 0, sums, around)
-    image = chosen[..., :3] / jnp.maximum(chosen[..., 3:], 1)
+    chosen = jnp.where(sums[..., -1:] > 0, sums, around)
+    image = chosen[..., :-1] / jnp.maximum(chosen[..., -1:], 1)
     return jnp.where((depth > 0)[..., None], image, 0), depth
 
 
