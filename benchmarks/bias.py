@@ -20,8 +20,8 @@ import ipjax
 from benchmarks.measure import describe_device
 from ipjax.config import Config
 from ipjax.estimation.features import observe
-from ipjax.estimation.pipeline import SceneGrid
 from ipjax.estimation.refinement import refine
+from ipjax.estimation.scene import SceneGrid
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.frames import frame_turned
 from ipjax.synthetic import problems

@@ -11,8 +11,9 @@ from benchmarks.measure import compile_fresh, summarise, time_in_turns
 from ipjax.config import Config, MatchConfig
 from ipjax.estimation.alignment import align
 from ipjax.estimation.matching import match, select
-from ipjax.estimation.pipeline import SceneGrid, apparent_diameter, comparable, estimate
+from ipjax.estimation.pipeline import apparent_diameter, comparable, estimate
 from ipjax.estimation.refinement import refine
+from ipjax.estimation.scene import SceneGrid
 from ipjax.estimation.scoring import score
 from ipjax.inference.batching import compact
 from ipjax.synthetic import problems

@@ -11,19 +11,18 @@ from ipjax_kernels.positive import root
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from ipjax.cameras import mask_from_coverage, resize
 from ipjax.config import Config
 from ipjax.estimation.alignment import align
 from ipjax.estimation.confidence import covariance, find_rival, pair_information, probability, rotation_ambiguity
-from ipjax.estimation.contour import trace_contour
-from ipjax.estimation.features import identity_of, lift, object_features
+from ipjax.estimation.features import identity_of, object_features
 from ipjax.estimation.matching import match, select
 from ipjax.estimation.refinement import information, refine, settle
-from ipjax.estimation.residuals import Cloud
+from ipjax.estimation.scene import SceneGrid
 from ipjax.estimation.scoring import score, score_drawn, seen_share
+from ipjax.estimation.through_photo import estimate_through_photo
 from ipjax.estimation.validity import finite_estimate, finite_query, finite_templates
 from ipjax.metrics.poses import turn_angle
-from ipjax.records import Agreement, Camera, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
+from ipjax.records import Agreement, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
 
 
 def estimate(
@@ -67,6 +66,8 @@ def estimate(
         diameter = jnp.asarray(diameter, query.view.depth.dtype)
         has_size = jnp.isfinite(diameter) & (diameter > 0)
         usable, diameter = usable & has_size, jnp.where(has_size, diameter, 1)
+    if templates.reference is not None and config.score.ranking == "render":
+        return finite_estimate(estimate_through_photo(encoder, templates, query, key, config, diameter, usable))
     with jax.named_scope("match"):
         matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
@@ -128,7 +129,7 @@ class _Candidates(eqx.Module):
 
 
 def _settle_best(
-    templates: Templates, scene: "SceneGrid", found: _Candidates, pairs: Pairs, config: Config, *, scale_known: bool
+    templates: Templates, scene: SceneGrid, found: _Candidates, pairs: Pairs, config: Config, *, scale_known: bool
 ) -> _Candidates:
     """The candidates, the best refined by `settle`, for errors of the mesh; the pairs are those of all views."""
     strongest = jax.tree.map(lambda x: x[:, : config.refine.pairs].reshape(-1, *x.shape[2:]), pairs)
@@ -141,7 +142,7 @@ def _settle_best(
 
 def _certainty(
     templates: Templates,
-    scene: "SceneGrid",
+    scene: SceneGrid,
     found: _Candidates,
     pairs: Pairs,
     used: Bool[Array, "k"],
@@ -208,41 +209,6 @@ def _check_encoders(encoder: object, templates: Templates, query: Query) -> None
             f"{sources}: features of different encoders cannot be compared; onboard the object again, or use the "
             "encoder that it was made with"
         )
-
-
-class SceneGrid(eqx.Module):
-    """The crop on a coarse grid: what refinement fits and what scores compare with."""
-
-    cloud: Cloud
-    depth: Float[Array, "g g"]  # background included: it shows what occludes
-    mask: Bool[Array, "g g"]
-
-    def __init__(self, query: Query, grid: int, contour: int):
-        view, side = query.view, query.view.depth.shape[0]
-        if side % grid:
-            raise ValueError(f"score.resolution must divide the {side} pixels of a crop's side; {grid} does not")
-        camera = resize(view.camera, (side, side), (grid, grid))
-        covered = jnp.mean(view.mask.astype(view.depth.dtype).reshape(grid, side // grid, grid, -1), axis=(1, 3))
-        self.mask = mask_from_coverage(covered)
-        # A cell at the object's border has the depth of the object, or of what is beside it, never their mean.
-        of_both = lambda mask: lift(eqx.tree_at(lambda v: v.mask, view, mask), grid, grid, 0.05)
-        points, share = jax.vmap(of_both)(jnp.stack([view.mask, ~view.mask]))
-        known = (share > 0.3).reshape(2, grid, grid)
-        depth = jnp.where(known, points[..., 2].reshape(2, grid, grid), 0)
-        self.depth = jnp.where(self.mask, depth[0], depth[1])
-        self.cloud = Cloud(
-            points[0].reshape(grid, grid, 3),
-            known[0],
-            camera,
-            self.mask,
-            self.depth,
-            trace_contour(covered, self.depth, 0.1 * _extent(self.mask, self.depth, camera), contour),
-        )
-
-
-def _extent(mask: Bool[Array, "h w"], depth: Float[Array, "h w"], camera: Camera) -> Float[Array, ""]:
-    """The square root of the area that the mask covers, metres: a rough size of the object."""
-    return root(jnp.sum(jnp.where(mask, depth, 0) ** 2) / (camera.focal[0] * camera.focal[1]))
 
 
 def _rounds(

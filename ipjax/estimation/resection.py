@@ -22,6 +22,7 @@ from ipjax.config import MatchConfig, ResectConfig
 from ipjax.estimation.features import object_features
 from ipjax.estimation.matching import match, select
 from ipjax.estimation.residuals import Cloud
+from ipjax.estimation.scoring import chroma_correlation
 from ipjax.metrics.poses import turn_angle
 from ipjax.records import Matches, Pairs, Query, ReferenceView, Similarity, Templates
 
@@ -144,7 +145,7 @@ def resect(
 
 
 def _weak_support(weak, points, rays, normals, weight, threshold):
-    """Truncated quadratic support of each hypothesis by all pairs, a few at a time; surface that faces away has none."""
+    """Truncated quadratic support of each hypothesis by all pairs; surface that faces away gives none."""
     share = weight / jnp.maximum(jnp.sum(weight), 1e-9)
     part = 8
     padding = -share.shape[0] % part
@@ -185,11 +186,30 @@ class Drawing(eqx.Module):
     """The query as the photo's camera sees it from a candidate pose, compared with the photo."""
 
     overlap: Float[Array, ""]  # mean cosine of the patches that both cover
+    colour: Float[Array, ""]  # correlation of their colours, in [-1, 1]
     shared: Float[Array, ""]  # share of the photo's outline that both cover
     points: Float[Array, "p 3"]  # of the query, metres, behind each patch of the photo
     rays: Float[Array, "p 2"]  # where the photo shows what the drawing shows in that patch
     weight: Float[Array, "p"]
     depth: Float[Array, "h w"]  # metres
+
+
+def splat_query(
+    reference: ReferenceView,
+    query: Query,
+    rotation: Float[Array, "3 3"],
+    translation: Float[Array, "3"],
+    sight: Sight,
+) -> tuple[Float[Array, "h w 6"], Float[Array, "h w"]]:
+    """The query's measured surface as the photo's camera would see it: colour and place (metres, the query's camera) of
+    each pixel, and its depth in the photo's camera (metres, 0 = nothing)."""
+    view, lens = query.view, reference.view.camera
+    points = point_map(view.camera, view.depth).reshape(-1, 3)
+    placed = jnp.einsum("ij,nj->ni", rotation, points, precision="highest") + translation
+    measured = (view.mask & (view.depth > 0)).reshape(-1)
+    paint = jnp.concatenate([view.rgb.reshape(-1, 3), points], axis=-1)
+    behind = 0.05 * sight.query_extent
+    return splat_colours(placed, paint, measured, lens.focal, lens.centre, *reference.view.mask.shape, behind)
 
 
 def draw_query(
@@ -204,15 +224,8 @@ def draw_query(
     """The query's measured, coloured surface drawn into the photo's camera, described, and matched nearby."""
     reference = templates.reference
     assert reference is not None
-    view, lens = query.view, reference.view.camera
     height, width = reference.view.mask.shape
-    points = point_map(view.camera, view.depth).reshape(-1, 3)
-    placed = jnp.einsum("ij,nj->ni", rotation, points, precision="highest") + translation
-    measured = (view.mask & (view.depth > 0)).reshape(-1)
-    paint = jnp.concatenate([view.rgb.reshape(-1, 3), points], axis=-1)
-    image, depth = splat_colours(
-        placed, paint, measured, lens.focal, lens.centre, height, width, 0.05 * sight.query_extent
-    )
+    image, depth = splat_query(reference, query, rotation, translation, sight)
     shown = depth > 0
     features = object_features(encoder(jnp.where(shown[..., None], image[..., :3], 0)), templates)
     rows, columns, channels = features.shape
@@ -220,9 +233,9 @@ def draw_query(
     mean = lambda x: jnp.mean(x.reshape(rows, height // rows, columns, width // columns, -1), axis=(1, 3)).reshape(
         rows * columns, -1
     )
-    cover = mean(shown.astype(points.dtype))[:, 0]
+    cover = mean(shown.astype(depth.dtype))[:, 0]
     where = mean(jnp.where(shown[..., None], image[..., 3:], 0)) / jnp.maximum(cover, 1e-6)[:, None]
-    outline = mean(reference.view.mask.astype(points.dtype))[:, 0]
+    outline = mean(reference.view.mask.astype(depth.dtype))[:, 0]
     photo = jnp.where(reference.patches.valid[:, None], reference.patches.features, 0).astype(features.dtype)
     cosine = jnp.sum(features * photo, axis=-1)
     shared = jnp.minimum(cover, outline) * reference.patches.valid
@@ -238,8 +251,17 @@ def draw_query(
     pull = pull / jnp.maximum(jnp.sum(pull, axis=1, keepdims=True), 1e-9)
     rays = jnp.matmul(pull, rays_of(reference, reference.patches.points), precision="highest")
     weight = jnp.where(found & (cover > config.cover), jnp.maximum(best, 0), 0)
+    drawn_colour = mean(jnp.where(shown[..., None], image[..., :3], 0)) / jnp.maximum(cover, 1e-6)[:, None]
+    photo_colour = jnp.where(reference.view.mask[..., None], reference.view.rgb, 0)
+    photo_colour = mean(photo_colour) / jnp.maximum(outline, 1e-6)[:, None]
     return Drawing(
-        jnp.clip(overlap, 0, 1), jnp.sum(shared) / jnp.maximum(jnp.sum(outline), 1e-6), where, rays, weight, depth
+        overlap=jnp.clip(overlap, 0, 1),
+        colour=chroma_correlation(drawn_colour, photo_colour, shared),
+        shared=jnp.sum(shared) / jnp.maximum(jnp.sum(outline), 1e-6),
+        points=where,
+        rays=rays,
+        weight=weight,
+        depth=depth,
     )
 
 
@@ -272,13 +294,19 @@ def polish(
 
 def metres_per_unit(
     reference: ReferenceView, depth: Float[Array, "h w"], fallback: Float[Array, ""]
-) -> Float[Array, ""]:
-    """The size of a model unit: the median ratio of measured depth in the photo's camera to the guessed one."""
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The size of a model unit, and the distance (model units) of the guessed front that it was found on.
+
+    Medians of the ratio of the measured depth in the photo's camera to the guessed one, where both are; ``fallback``
+    where they nowhere are.
+    """
     guess = reference.view.depth
     both = (depth > 0) & (guess > 0)
-    ratio = jnp.sort(jnp.where(both, depth / jnp.where(both, guess, 1), jnp.inf).reshape(-1))
-    count = jnp.sum(both)
-    return jnp.where(count > 0, ratio[jnp.maximum(count - 1, 0) // 2], fallback)
+    last = jnp.maximum(jnp.sum(both, dtype=jnp.int32) - 1, 0) // 2
+    median = lambda x: jnp.sort(jnp.where(both, x, jnp.inf).reshape(-1))[last]
+    unit, front = median(depth / jnp.where(both, guess, 1)), median(guess)
+    found = jnp.any(both)
+    return jnp.where(found, unit, fallback), jnp.where(found, front, reference.camera_from_object.translation[2])
 
 
 def query_from_object(
@@ -286,10 +314,17 @@ def query_from_object(
     rotation: Float[Array, "3 3"],
     translation: Float[Array, "3"],
     unit: Float[Array, ""],
+    behind: Float[Array, ""] | float = 0.0,
 ) -> Similarity:
-    """The object's pose in the query's camera, from that of the photo's camera and the size of a model unit."""
+    """The object's pose in the query's camera.
+
+    Args:
+      rotation, translation: the photo's camera from the query's, metres.
+      unit: metres of a model unit.
+      behind: metres that the object is moved away from the photo's camera.
+    """
     photo = reference.camera_from_object
-    back = rotation.T
-    turned = jnp.matmul(back, photo.rotation, precision="highest")
-    shift = jnp.matmul(back, unit * photo.translation - translation, precision="highest")
-    return Similarity(turned, shift, unit)
+    ahead = jnp.zeros_like(translation).at[2].set(behind)
+    turned = jnp.matmul(rotation.T, photo.rotation, precision="highest")
+    shift = jnp.matmul(rotation.T, unit * photo.translation + ahead - translation, precision="highest")
+    return Similarity(turned, shift, jnp.asarray(unit, translation.dtype))

@@ -84,3 +84,10 @@ def consensus(source, target, weight, threshold, sets, refits=0, rank="msac", re
         if (score, tie) > best_rank:
             best, best_rank = (*similarity, score, inliers), (score, tie)
     return best
+
+
+def resection_loss(rotation, translation, points, rays, weight, width):
+    """The root of each pair's weighted Geman–McClure loss of its ray, [k]: half their squares' sum is half the loss."""
+    placed = points @ np.asarray(rotation).T + translation
+    squared = np.sum((placed[:, :2] / placed[:, 2:] - rays) ** 2, axis=1) / width**2
+    return np.sqrt(np.where(placed[:, 2] > 0, squared / (1 + squared), 1) * weight / np.sum(weight))

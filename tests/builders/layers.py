@@ -15,6 +15,8 @@ ORDER = [
     ["ipjax.estimation", "ipjax.estimation.validity", "ipjax.estimation.contour"],
     ["ipjax.estimation.residuals"],
     [f"ipjax.estimation.{s}" for s in ("features", "matching", "alignment", "refinement", "scoring", "confidence")],
+    ["ipjax.estimation.scene", "ipjax.estimation.resection"],
+    ["ipjax.estimation.through_photo"],
     ["ipjax.estimation.pipeline"],
     # What cannot be jitted.
     ["ipjax.progress"],

@@ -13,9 +13,9 @@ from benchmarks.bias import contour_errors, pose_errors, summary
 from ipjax.config import RefineConfig
 from ipjax.estimation.contour import trace_contour
 from ipjax.estimation.features import observe
-from ipjax.estimation.pipeline import SceneGrid
 from ipjax.estimation.refinement import refine, settle, unevenness
 from ipjax.estimation.residuals import Cloud, linearise, nearest_visible, strained
+from ipjax.estimation.scene import SceneGrid
 from ipjax.inference.frames import frame
 from ipjax.records import Pairs
 from ipjax.synthetic import problems

@@ -1,0 +1,164 @@
+"""The pose of an object that one photo without depth showed: through the photo's camera, not through its guessed shape.
+
+What was guessed enters where nothing else is known: the distance from the measured front to the object's centre, and
+with it the size.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from ipjax_kernels.perspective import Resection, refine_resection
+from ipjax_kernels.positive import invert_positive, root
+from jax import lax
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from ipjax.config import Config
+from ipjax.estimation.confidence import find_rival, probability, rotation_ambiguity
+from ipjax.estimation.features import object_features
+from ipjax.estimation.resection import (
+    match_photo,
+    measure_sight,
+    metres_per_unit,
+    patch_normals,
+    polish,
+    query_from_object,
+    rays_of,
+    resect,
+    splat_query,
+)
+from ipjax.estimation.scene import SceneGrid
+from ipjax.estimation.scoring import depth_agreement
+from ipjax.records import Agreement, Hypotheses, PoseEstimate, Query, ReferenceView, Similarity, Templates
+
+
+def estimate_through_photo(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
+    templates: Templates,
+    query: Query,
+    key: PRNGKeyArray,
+    config: Config,
+    diameter: Float[Array, ""] | None,
+    usable: Bool[Array, ""],
+) -> PoseEstimate:
+    """:func:`ipjax.estimate` of an object whose templates have a reference view.
+
+    Args:
+      encoder: with it the query is drawn into the photo's camera from each candidate, which refines and ranks them;
+        without it they are ranked by how many pairs agree.
+      usable: whether there is anything to estimate; without it there is no success.
+    """
+    reference, resection = templates.reference, config.resect
+    assert reference is not None
+    query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
+    sight = measure_sight(reference, query)
+    with jax.named_scope("match"):
+        matches, pairs = match_photo(query, templates, resection, config.match)
+        rays = rays_of(reference, pairs.object)
+    scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
+    side = round(query.patches.valid.shape[0] ** 0.5)
+    with jax.named_scope("resect"):
+        normals = patch_normals(scene.cloud, side, side)[matches.query]
+        found = resect(pairs, rays, normals, sight, key, resection)
+    with jax.named_scope("draw"):
+        if encoder is None:
+            look = jax.vmap(lambda turn, shift: splat_query(reference, query, turn, shift, sight)[1])
+            camera, depth = (found.rotation, found.translation), look(found.rotation, found.translation)
+            every = lambda x: jnp.broadcast_to(
+                x.reshape(-1, *x.shape[2:]), (found.support.shape[0], *x.reshape(-1, *x.shape[2:]).shape)
+            )
+            points, where, weight = every(pairs.camera), every(rays), every(pairs.weight)
+            overlap = colour = shared = jnp.ones_like(found.support)
+            score = found.support
+        else:
+            refine = lambda pose: polish(encoder, templates, query, pose, sight, resection)
+            # One image at a time is fastest on a CPU; accelerators want them all.
+            camera, drawn = lax.platform_dependent(
+                (found.rotation, found.translation), cpu=lambda x: lax.map(refine, x), default=jax.vmap(refine)
+            )
+            points, where, weight = drawn.points, drawn.rays, drawn.weight
+            depth, overlap, colour, shared = drawn.depth, drawn.overlap, drawn.colour, drawn.shared
+            score = jnp.where(found.support >= 0, overlap, -1)
+        typical = sight.query_extent / sight.extent  # the distance of the photo's camera, metres
+        fallback = typical / reference.camera_from_object.translation[2]
+        units, front = jax.vmap(lambda one: metres_per_unit(reference, one, fallback))(depth)
+        behind = jnp.zeros_like(units)
+        if diameter is not None:
+            # The front is where it was measured; of the given size, the rest is nearer or farther.
+            behind = (units - diameter) * front
+            units = jnp.full_like(units, diameter)
+        poses = jax.vmap(lambda *one: query_from_object(reference, *one))(*camera, units, behind)
+    order = lax.top_k(score, score.shape[0])[1]
+    everything = poses, camera, score, overlap, colour, shared, found.support, points, where, weight
+    everything = jax.tree.map(lambda x: x[order], everything)
+    (poses, _, score, *_), best = everything, jax.tree.map(lambda x: x[0], everything)
+    pose, camera, _, overlap, colour, shared, support, points, where, weight = best
+    success = usable & (score[0] >= 0)
+    width = resection.width * sight.diagonal
+    fit = refine_resection(*camera, points, where, weight, width, steps=0)
+    placed = jnp.sum(camera[0][None] * points[:, None, :], axis=-1) + camera[1]
+    offset = placed[:, :2] / jnp.maximum(placed[:, 2:], 1e-6) - where
+    squared = jnp.sum(offset**2, axis=-1)
+    near = (weight > 0) & (squared < (resection.threshold * sight.diagonal) ** 2) & success
+    count = jnp.sum(near, dtype=jnp.int32)
+    beside = jnp.sum(jnp.where(near, squared * placed[:, 2] ** 2, 0)) / jnp.maximum(count, 1).astype(squared.dtype)
+    spread, scale_std = _spread(reference, camera, fit, pose, config, scale_known=diameter is not None)
+    with jax.named_scope("confidence"):
+        agreement = Agreement(
+            depth=depth_agreement(templates.surface, scene.depth, scene.mask, scene.cloud.camera, pose, config.score),
+            features=jnp.clip(support, 0, 1),
+            drawn=overlap,
+            colour=colour,
+            seen=shared,
+            rival=find_rival(poses, jnp.maximum(score, 0)),
+        )
+        weights = jnp.stack([jnp.asarray(x, score.dtype) for x in config.confidence.photo])
+        confidence = jnp.where(success, probability(agreement, weights), 0)
+    nearest = jnp.argmax(jnp.sum(templates.camera_from_object.rotation * pose.rotation, axis=(-2, -1)))
+    return PoseEstimate(
+        camera_from_object=pose,
+        confidence=confidence,
+        present=success & (confidence >= config.confidence.least),
+        covariance=spread,
+        scale_std=scale_std,
+        ambiguity=rotation_ambiguity(poses, score, spread[:3, :3], config.confidence),
+        agreement=agreement,
+        hypotheses=Hypotheses(poses, jnp.clip(score, 0, 1)),
+        view=nearest.astype(jnp.int32),
+        view_score=matches.ranking,
+        inliers=count,
+        rmse=root(beside),
+        success=success,
+    )
+
+
+def _spread(
+    reference: ReferenceView,
+    camera: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+    fit: Resection,
+    pose: Similarity,
+    config: Config,
+    *,
+    scale_known: bool,
+) -> tuple[Float[Array, "6 6"], Float[Array, ""]]:
+    """The covariance of rotation (rad) and translation (metres) in the query's axes, and the scale's deviation.
+
+    Across the photo's ray the rays tell; along it, and with it in size, the guess is only as good as guesses are.
+    """
+    scale, dtype = pose.scale, fit.information.dtype
+    unit = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, scale, dtype)])
+    # In diameters, and bounded where nothing is determined: a radian, half a diameter.
+    known = fit.information * unit[:, None] * unit[None] * config.resect.independent / jnp.maximum(fit.loss, 1e-3)
+    found = invert_positive(known + jnp.diag(jnp.array([1, 1, 1, 4, 4, 4], dtype)))
+    along = found[5, 5]
+    # The distance of the photo's camera moves no measured surface, and so not the object on it.
+    guessed = config.resect.guess**2
+    found = found.at[5, :].set(0).at[:, 5].set(0).at[5, 5].set(guessed)
+    back = camera[0].T
+    turn = jnp.zeros((6, 6), dtype).at[:3, :3].set(back).at[3:, 3:].set(back) * unit[:, None]
+    spread = jnp.matmul(jnp.matmul(turn, found, precision="highest"), turn.T, precision="highest")
+    if scale_known:
+        return spread, jnp.zeros_like(scale)
+    distance = reference.camera_from_object.translation[2]
+    return spread, scale * root(guessed + along) / distance
