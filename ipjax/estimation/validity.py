@@ -13,7 +13,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ipjax.records import Appearance, Camera, Patches, PoseEstimate, Query, Similarity, Surface, Templates, View
+from ipjax.records import (
+    Appearance,
+    Camera,
+    Patches,
+    PoseEstimate,
+    Query,
+    ReferenceView,
+    Similarity,
+    Surface,
+    Templates,
+    View,
+)
 
 _Points = TypeVar("_Points", Surface, Appearance)
 
@@ -51,11 +62,12 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
     """Templates of finite numbers, of one object; but the features of patches that are not valid stay as they are.
 
     A view without a finite pose and camera has no valid patch. A point of the surface or the appearance that is not
-    finite repeats one that is, without a normal: it faces no camera, as with ``ipjax.pad_templates``.
+    finite repeats one that is, without a normal: it faces no camera, as with ``ipjax.pad_templates``. The reference
+    view is treated as a view, and its patches as patches.
 
     Returns:
-      The templates, and whether the object is usable: it has a finite surface point, and its axes, mean and basis are
-      finite throughout.
+      The templates, and whether the object is usable: it has a finite surface point, its axes, mean and basis are
+      finite throughout, and so are pose and camera of its reference view, if it has one.
     """
     patches, pose = templates.patches, templates.camera_from_object
     camera, has_camera = _finite_camera(templates.camera)
@@ -70,7 +82,11 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
     )
     surface, has_points = _finite_points(templates.surface)
     needed = [templates.mean, templates.axes, *([] if templates.basis is None else [templates.basis])]
-    usable = jnp.stack([has_points, *(jnp.all(jnp.isfinite(x)) for x in needed)])
+    reference, has_place = None, []
+    if templates.reference is not None:
+        reference, has_reference = _finite_reference(templates.reference)
+        has_place = [has_reference]
+    usable = jnp.stack([has_points, *has_place, *(jnp.all(jnp.isfinite(x)) for x in needed)])
     kept = dataclasses.replace(
         templates,
         patches=shown,
@@ -84,6 +100,7 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
         axes=jnp.where(jnp.all(jnp.isfinite(templates.axes)), templates.axes, jnp.eye(3, dtype=templates.axes.dtype)),
         basis=None if templates.basis is None else _or_zero(templates.basis),
         appearance=None if templates.appearance is None else _finite_points(templates.appearance)[0],
+        reference=reference,
     )
     return kept, jnp.all(usable)
 
@@ -111,6 +128,14 @@ def finite_estimate(found: PoseEstimate) -> PoseEstimate:
         success=found.success & fine,
     )
     return jax.tree.map(lambda x: _or_zero(x) if jnp.issubdtype(x.dtype, jnp.inexact) else x, answer)
+
+
+def _finite_reference(reference: ReferenceView) -> tuple[ReferenceView, Bool[Array, ""]]:
+    """A reference view of finite numbers, and whether it has a camera and a pose: poses are found through it."""
+    view, has_camera = finite_view(reference.view)
+    placed = _finite_pose(reference.camera_from_object)
+    pose = _or_identity(reference.camera_from_object, placed)
+    return ReferenceView(view, finite_patches(reference.patches), pose), has_camera & placed
 
 
 def _finite_camera(camera: Camera) -> tuple[Camera, Bool[Array, "*b"]]:

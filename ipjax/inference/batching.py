@@ -16,7 +16,8 @@ def compact(templates: Templates, *, multiple: int = 32) -> Templates:
 
     The valid patches come first, in their old order, then at least one invalid one, as many as give all templates the
     same number, a multiple of ``multiple``. The last patch of the grid always stays, valid or not, so that the size of
-    the grid can be read off ``grid``. To be done once, before ``estimate``; an object file keeps every patch.
+    the grid can be read off ``grid``. The reference view keeps its whole grid. To be done once, before ``estimate``; an
+    object file keeps every patch.
 
     Raises:
         ValueError: the templates are no single object's, or ``multiple`` is not positive.
@@ -44,7 +45,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
 
     What is added is absent. Patches are not valid. Views repeat the last one's pose and camera without a valid patch:
     they rank behind all others and no feature is taken from them. Surface and appearance points repeat the first one
-    with a normal of zero: they face no camera, so they are neither fitted nor drawn and widen no outline.
+    with a normal of zero: they face no camera, so they are neither fitted nor drawn and widen no outline. Reference
+    views are not padded: all have one size, as objects from photos have that were onboarded alike.
     An object's estimate is the same as without padding, up to rounding, if it has at least ``config.match.views`` views
     and ``config.refine.points`` surface points; with fewer, it gets as many hypotheses and points as the others.
 
@@ -55,8 +57,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
         Templates with a leading axis of the objects.
 
     Raises:
-        ValueError: there is none, or they are not alike: of different encoders, features of different lengths, or some
-            with a basis or an appearance and some without.
+        ValueError: there is none, or they are not alike: of different encoders, features of different lengths,
+            reference views of different sizes, or some with a basis, appearance or reference view and some without.
     """
     objects = list(objects)
     if not objects:
@@ -67,20 +69,49 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
             "pad_templates takes single objects whose features have one shape [views, patches, channels], not "
             + " and ".join(str(np.shape(o.patches.features)) for o in objects)
         )
-    encoders = sorted({o.patches.encoder for o in objects if o.patches.encoder is not None})
+    encoders = sorted({e for o in objects for e in _encoders(o) if e is not None})
     if len(encoders) > 1:
         raise ValueError(f"these objects were onboarded with different encoders: {', '.join(map(repr, encoders))}")
-    objects = [dataclasses.replace(o, patches=dataclasses.replace(o.patches, encoder=None)) for o in objects]
+    objects = [_described_by(o, None) for o in objects]
     for name in ("basis", "appearance"):
         if len({getattr(o, name) is None for o in objects}) > 1:
             raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
+    _check_references(objects)
     views, patches = (max(o.norm.shape[axis] for o in objects) for axis in (0, 1))
     count = max(o.surface.points.shape[0] for o in objects)
     drawn = max(0 if o.appearance is None else o.appearance.points.shape[0] for o in objects)
     padded = [_pad(o, views, patches, count, drawn) for o in objects]
     stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
-    patches = dataclasses.replace(stacked.patches, encoder=encoders[0] if encoders else None)
-    return dataclasses.replace(stacked, patches=patches)
+    return _described_by(stacked, encoders[0] if encoders else None)
+
+
+def _check_references(objects: list[Templates]) -> None:
+    """All have a reference view of one size, or none has one."""
+    views = [o.reference for o in objects]
+    if len({view is None for view in views}) > 1:
+        raise ValueError(
+            "some of these objects were made from a photo without depth, through which their pose is found, and some "
+            "were not: pad them apart"
+        )
+    sizes = sorted({(np.shape(view.view.mask), np.shape(view.patches.valid)) for view in views if view is not None})
+    if len(sizes) > 1:
+        told = " and ".join(f"{list(pixels)} pixels with {patches[0]} patches" for pixels, patches in sizes)
+        raise ValueError(f"the reference views of these objects differ in size, {told}; onboard them alike")
+
+
+def _encoders(templates: Templates) -> list[str | None]:
+    """Who described the templates, and their reference view if they have one."""
+    reference = templates.reference
+    return [templates.patches.encoder, *([] if reference is None else [reference.patches.encoder])]
+
+
+def _described_by(templates: Templates, encoder: str | None) -> Templates:
+    """The templates, and their reference view if they have one, with another name of their encoder."""
+    name = lambda patches: dataclasses.replace(patches, encoder=encoder)
+    reference = templates.reference
+    if reference is not None:
+        reference = dataclasses.replace(reference, patches=name(reference.patches))
+    return dataclasses.replace(templates, patches=name(templates.patches), reference=reference)
 
 
 def _pad(templates: Templates, views: int, patches: int, count: int, drawn: int) -> Templates:

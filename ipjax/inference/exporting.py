@@ -22,7 +22,7 @@ from ipjax.config import Config
 from ipjax.estimation.pipeline import estimate
 from ipjax.files.settings import describe_config
 from ipjax.files.storage.writing import write_bytes, write_text
-from ipjax.records import Camera, Patches, Query, Similarity, Surface, Templates, View
+from ipjax.records import Camera, Patches, Query, ReferenceView, Similarity, Surface, Templates, View
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 PROMISE = (
@@ -33,6 +33,12 @@ PROMISE = (
 _UNITS = {
     "templates.patches.points": "model units (diameters), object frame",
     "templates.camera_from_object.translation": "model units",
+    "templates.reference.patches.points": "model units (diameters), object frame",
+    "templates.reference.camera_from_object.translation": "model units",
+    "templates.reference.view.depth": "model units along z, 0 = unknown",
+    "templates.reference.view.rgb": "[0, 1]",
+    "templates.reference.view.camera.focal": "pixels (x, y)",
+    "templates.reference.view.camera.centre": "pixels (x, y), first pixel's centre at 0",
     "query.patches.points": "metres, camera frame",
     "query.view.depth": "metres along z, 0 = unknown",
     "query.view.rgb": "[0, 1]",
@@ -58,13 +64,24 @@ def _to_templates(tree: dict[str, Any]) -> Templates:
         surface=Surface(**tree["surface"]),
         **{name: tree[name] for name in ("mean", "norm", "seen", "extents", "axes")},
         basis=tree.get("basis"),
+        reference=_to_reference(tree["reference"]) if "reference" in tree else None,
     )
 
 
+def _to_reference(tree: dict[str, Any]) -> ReferenceView:
+    return ReferenceView(
+        view=_to_view(tree["view"]),
+        patches=Patches(**tree["patches"]),
+        camera_from_object=Similarity(**tree["camera_from_object"]),
+    )
+
+
+def _to_view(tree: dict[str, Any]) -> View:
+    return View(tree["rgb"], tree["depth"], tree["mask"], Camera(**tree["camera"]))
+
+
 def _to_query(tree: dict[str, Any]) -> Query:
-    view = tree["view"]
-    camera = Camera(**view["camera"])
-    return Query(Patches(**tree["patches"]), View(view["rgb"], view["depth"], view["mask"], camera))
+    return Query(Patches(**tree["patches"]), _to_view(tree["view"]))
 
 
 def blank_query(templates: Templates, resolution: int) -> Query:

@@ -1,10 +1,13 @@
 """An onboarded object of random numbers, and object files with altered content."""
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ipjax.files.objects.record import ObjectInfo
-from ipjax.records import Camera, Patches, Similarity, Surface, Templates
+from ipjax.records import Camera, Patches, ReferenceView, Similarity, Surface, Templates, View
 
 
 def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templates, ObjectInfo]:
@@ -51,6 +54,19 @@ def make_object(views=5, patches=4, channels=8, points=7, seed=0) -> tuple[Templ
         pictures=np.full((views, 28, 28, 3), (200, 100, 50), np.uint8),
     )
     return templates, info
+
+
+def with_reference(templates: Templates, side=28, seed=0) -> Templates:
+    """As if made from a photo without depth of so many pixels a side, which the first template shows."""
+    rng = np.random.default_rng(seed)
+    mask = rng.random((side, side)) < 0.6
+    rgb = rng.integers(0, 256, (side, side, 3)).astype(np.float32) / 255 * mask[..., None]
+    depth = np.where(mask, rng.uniform(2, 3, mask.shape), 0)
+    first = lambda tree: jax.tree.map(lambda x: x[0], tree)
+    camera = Camera(focal=jnp.asarray([40.0, 41.0]), centre=jnp.asarray([side / 2, side / 2 - 1]))
+    view = View(jnp.asarray(rgb), jnp.asarray(depth, jnp.float32), jnp.asarray(mask), camera)
+    reference = ReferenceView(view, first(templates.patches), first(templates.camera_from_object))
+    return dataclasses.replace(templates, reference=reference)
 
 
 def rewrite(path, change=None, drop=None, metadata=None):

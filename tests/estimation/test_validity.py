@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders.objects import make_object
+from builders.objects import make_object, with_reference
 from builders.tiny_pipeline import DRAWN, make_sized_query, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -256,6 +256,46 @@ def test_gradients_through_matches_are_those_without_the_poison(centred):
         np.testing.assert_allclose(told(found), told(wanted), rtol=1e-5, atol=1e-6)
 
 
+# Of a reference view: the mark that says "absent", or that the object is not usable, for its pose is found through it.
+OF_REFERENCE = {
+    ".view.rgb": ".view.mask",
+    ".view.depth": ".view.depth",
+    ".patches.features": ".patches.valid",
+    ".patches.points": ".patches.valid",
+    ".patches.grid": ".patches.valid",
+    ".view.camera.focal": "nothing",
+    ".view.camera.centre": "nothing",
+    ".camera_from_object.rotation": "nothing",
+    ".camera_from_object.translation": "nothing",
+    ".camera_from_object.scale": "nothing",
+}
+finite = jax.jit(finite_templates)
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("name", OF_REFERENCE)
+def test_a_reference_view_is_absent_where_it_is_no_number(name, bad):
+    templates = with_reference(make_object()[0])
+    leaves, structure = flatten(templates.reference), jax.tree.structure(templates.reference)
+    assert {key for key, leaf in leaves.items() if leaf.dtype.kind == "f"} == OF_REFERENCE.keys()
+    wanted = {key: leaf.copy() for key, leaf in leaves.items()}
+    mark = OF_REFERENCE[name]
+    row = () if mark == "nothing" else tuple(np.argwhere(leaves[mark])[1])
+    leaves[name][row] = bad
+    reference = jax.tree.unflatten(structure, [jnp.asarray(x) for x in leaves.values()])
+    found, usable = finite(dataclasses.replace(templates, reference=reference))
+    assert bool(usable) == (mark != "nothing")
+    told = flatten(found.reference)
+    if mark == "nothing":
+        assert all(np.isfinite(leaf).all() for leaf in told.values())
+        return
+    wanted[name][row] = 0
+    wanted[mark][row] = 0
+    for key, leaf in wanted.items():
+        np.testing.assert_array_equal(told[key], leaf)
+    assert finite(dataclasses.replace(templates, reference=None))[0].reference is None
+
+
 def scene() -> dict:
     """A ball before a wall."""
     rows, columns = np.mgrid[:120, :160]
@@ -311,6 +351,21 @@ def test_load_leaves_out_patches_that_are_no_numbers(tmp_path, name, bad):
     wanted = np.array(templates.patches.valid)
     wanted[2, 1] = False
     np.testing.assert_array_equal(load(path)[0].patches.valid, wanted)
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("name", ["features", "points", "grid"])
+def test_load_leaves_out_patches_of_the_photo_that_are_no_numbers(tmp_path, name, bad):
+    templates, info = make_object()
+    templates = with_reference(templates)
+    path = save(tmp_path / "mug.ipjax", templates, info)
+    poison_file(path, f"reference.{name}", 0, bad)
+    found = load(path)[0]
+    wanted = np.array(templates.reference.patches.valid)
+    assert wanted[0]
+    wanted[0] = False
+    np.testing.assert_array_equal(found.reference.patches.valid, wanted)
+    np.testing.assert_array_equal(found.patches.valid, templates.patches.valid)
 
 
 @pytest.mark.parametrize("name", ["mean", "axes", "rotation", "focal", "extents"])

@@ -2,7 +2,7 @@
 
 One safetensors file (https://github.com/huggingface/safetensors). Its metadata holds one JSON text under the
 key ``ipjax``: format version, names of the object and the encoder, how the normalised object frame lies in the user's
-mesh, and a checksum. Tensors, for v templates of p patches with c channels:
+mesh, and a checksum. Tensors, for v templates of p patches with c channels, and a photo of s² pixels and q patches:
 
     features f16 [v p f] · mean f32 [c] · norm f32 [v p] · basis f32 [f c]          without the optional basis f = c
     points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
@@ -12,8 +12,18 @@ mesh, and a checksum. Tensors, for v templates of p patches with c channels:
     mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
     pictures u8 [bytes] · pictures.end i64 [v]                                       optional, one JPEG per template
     photo u8 [bytes]                                                                 optional, JPEG of the reference
+    reference.rgb u8 [s s 3] · reference.depth f32 [s s] · reference.mask bool [s s] optional, to find poses through
+    reference.features f16 [q f] · reference.points f32 [q 3] · reference.grid f32 [q 2] · reference.valid bool [q]
+    reference.rotation f32 [3 3] · reference.translation f32 [3] · reference.focal, reference.centre f32 [2]
 
-Lengths are model units: the object's bounding box is centred at the origin and its diameter is 1.
+Lengths are model units: the object's bounding box is centred at the origin and its diameter is 1. Of the tensors under
+``appearance.`` and of those under ``reference.`` a file holds all or none. The latter are the photo without depth that
+the object was made from, as ``ipjax.records.ReferenceView`` has it: a square crop whose depth was guessed by the
+reconstruction, its patches in the object's frame, and ``camera_from_object`` with its camera. ``photo`` is there
+for people, with or without them. Templates that were saved after ``ipjax.compact`` have fewer patches than the
+photo, which keeps all of its own.
+
+Format 1 had no ``reference.`` tensors; its files are read as they are, and have no reference view.
 """
 
 import hashlib
@@ -22,7 +32,8 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 1
+FORMAT = 2  # the one written
+READABLE = (1, FORMAT)
 SUFFIX = ".ipjax"
 
 TEMPLATE_TENSORS = {
@@ -54,7 +65,19 @@ OPTIONAL_TENSORS = {
     "pictures": ("uint8", "j"),
     "pictures.end": ("int64", "v"),
     "photo": ("uint8", "i"),
+    "reference.rgb": ("uint8", "ss3"),
+    "reference.depth": ("float32", "ss"),
+    "reference.mask": ("bool", "ss"),
+    "reference.features": ("float16", "qf"),
+    "reference.points": ("float32", "q3"),
+    "reference.grid": ("float32", "q2"),
+    "reference.valid": ("bool", "q"),
+    "reference.rotation": ("float32", "33"),
+    "reference.translation": ("float32", "3"),
+    "reference.focal": ("float32", "2"),
+    "reference.centre": ("float32", "2"),
 }
+_WHOLE = ("appearance.", "reference.")  # a file holds all of these tensors or none
 
 
 def hash_content(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:
@@ -70,7 +93,11 @@ def hash_content(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:
 
 def check_shapes(found: dict[str, tuple[str, tuple[int, ...]]], where: str) -> None:
     """Names, types and shapes fit one another; letters stand for one length each."""
-    missing = sorted(TEMPLATE_TENSORS.keys() - found.keys())
+    needed = set(TEMPLATE_TENSORS)
+    for prefix in _WHOLE:
+        if any(name.startswith(prefix) for name in found):
+            needed |= {name for name in OPTIONAL_TENSORS if name.startswith(prefix)}
+    missing = sorted(needed - found.keys())
     unknown = sorted(found.keys() - TEMPLATE_TENSORS.keys() - OPTIONAL_TENSORS.keys())
     if missing or unknown:
         what = f"{missing[0]} is missing" if missing else f"{unknown[0]!r} is unknown"

@@ -9,11 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from ipjax.estimation.features import identity_of
-from ipjax.files.objects.layout import FORMAT, TEMPLATE_TENSORS, check_shapes, hash_content
+from ipjax.files.objects.layout import FORMAT, READABLE, TEMPLATE_TENSORS, check_shapes, hash_content
 from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.storage.budget import check_budget, read_safetensors_header
 from ipjax.files.storage.parsing import parse_json
-from ipjax.records import UNNAMED, Appearance, Camera, Patches, Similarity, Surface, Templates
+from ipjax.records import (
+    UNNAMED,
+    Appearance,
+    Camera,
+    Patches,
+    ReferenceView,
+    Similarity,
+    Surface,
+    Templates,
+    View,
+)
 
 
 def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
@@ -41,7 +51,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
                 features=device["features"],
                 points=device["points"],
                 grid=device["grid"],
-                valid=jnp.asarray(tensors["valid"] & _are_finite(tensors)),
+                valid=jnp.asarray(_usable_patches(tensors) & np.isfinite(tensors["norm"])),
                 encoder=made_by,
             ),
             mean=device["mean"],
@@ -60,17 +70,18 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
             axes=device["axes"],
             basis=jnp.asarray(tensors["basis"]) if "basis" in tensors else None,
             appearance=_make_appearance(tensors),
+            reference=_make_reference_view(tensors, made_by),
         ),
         info,
     )
 
 
-def _are_finite(tensors: dict[str, np.ndarray]) -> np.ndarray:
-    """Which patches have no number that is not finite; the others are not valid."""
-    known = np.isfinite(tensors["norm"])
+def _usable_patches(tensors: dict[str, np.ndarray], prefix: str = "") -> np.ndarray:
+    """Which patches are valid: those that the file says are, without those that have a number that is not finite."""
+    valid = tensors[f"{prefix}valid"]
     for name in ("features", "points", "grid"):
-        known = known & np.isfinite(tensors[name]).all(axis=-1)
-    return known
+        valid = valid & np.isfinite(tensors[prefix + name]).all(axis=-1)
+    return valid
 
 
 def _make_appearance(tensors: dict[str, np.ndarray]) -> Appearance | None:
@@ -80,6 +91,32 @@ def _make_appearance(tensors: dict[str, np.ndarray]) -> Appearance | None:
         points=jnp.asarray(tensors["appearance.points"], jnp.float32),
         normals=jnp.asarray(tensors["appearance.normals"], jnp.float32),
         colours=jnp.asarray(tensors["appearance.colours"].astype(np.float32) / 255),
+    )
+
+
+def _make_reference_view(tensors: dict[str, np.ndarray], made_by: str | None) -> ReferenceView | None:
+    if "reference.rgb" not in tensors:
+        return None
+    device = {name: jnp.asarray(x) for name, x in tensors.items() if name.startswith("reference.")}
+    return ReferenceView(
+        view=View(
+            rgb=jnp.asarray(tensors["reference.rgb"].astype(np.float32) / 255),
+            depth=device["reference.depth"],
+            mask=device["reference.mask"],
+            camera=Camera(focal=device["reference.focal"], centre=device["reference.centre"]),
+        ),
+        patches=Patches(
+            features=device["reference.features"],
+            points=device["reference.points"],
+            grid=device["reference.grid"],
+            valid=jnp.asarray(_usable_patches(tensors, "reference.")),
+            encoder=made_by,
+        ),
+        camera_from_object=Similarity(
+            rotation=device["reference.rotation"],
+            translation=device["reference.translation"],
+            scale=jnp.ones((), jnp.float32),
+        ),
     )
 
 
@@ -100,20 +137,18 @@ def check(path: str | Path) -> list[str]:
     for name, array in tensors.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise ValueError(f"{path}: damaged: {name} has values that are not finite")
-    rotation = tensors["rotation"].astype(np.float64)
-    if np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation).min() < 0:
-        raise ValueError(f"{path}: damaged: the template poses hold something that is no rotation")
-    length = np.linalg.norm(tensors["features"].astype(np.float32), axis=-1)[tensors["valid"]]
-    if length.size == 0:
-        raise ValueError(f"{path}: no template shows any patch of the object")
-    if np.abs(length - 1).max() > 1e-2:
-        raise ValueError(f"{path}: damaged: features of valid patches are not unit vectors")
+    _check_described(tensors, path)
     views, patches, channels = tensors["features"].shape
     seen = tensors["valid"].sum(axis=1).mean()
     size = 1 / info.mesh_scale
     unit = f" ({size * info.metres_per_unit * 1e3:.1f} mm)" if info.metres_per_unit else ", unit unknown"
     photo = info.reference
     made = [] if photo is None else [f"made from the photo by {photo.method}; {photo.seen:.0%} of its surface was seen"]
+    if "reference.rgb" in tensors:
+        side, shown = len(tensors["reference.rgb"]), tensors["reference.valid"]
+        made.append(
+            f"poses are found through the photo: {side} pixels wide, {shown.sum()} of its {len(shown)} patches valid"
+        )
     return [
         f"object {info.name!r} from {info.mesh_file or 'a mesh'} (sha256 {info.mesh_sha256[:12] or 'unknown'})",
         f"diameter {size:g} in the mesh's unit{unit}",
@@ -123,6 +158,27 @@ def check(path: str | Path) -> list[str]:
         *made,
         *info.notes,
     ]
+
+
+def _check_described(tensors: dict[str, np.ndarray], path: Path) -> None:
+    """Poses are rotations and valid features unit vectors: of the templates, and of the photo where there is one.
+
+    The photo must have a camera, too; a template without one is only left out.
+    """
+    described = {"": ("the template poses hold", "no template shows")}
+    if "reference.rgb" in tensors:
+        described["reference."] = ("the photo's pose holds", "the photo does not show")
+    for prefix, (holds, shows) in described.items():
+        rotation = tensors[f"{prefix}rotation"].astype(np.float64)
+        if np.abs(rotation @ rotation.swapaxes(-1, -2) - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation).min() < 0:
+            raise ValueError(f"{path}: damaged: {holds} something that is no rotation")
+        length = np.linalg.norm(tensors[f"{prefix}features"].astype(np.float32), axis=-1)[tensors[f"{prefix}valid"]]
+        if length.size == 0:
+            raise ValueError(f"{path}: {shows} any patch of the object")
+        if np.abs(length - 1).max() > 1e-2:
+            raise ValueError(f"{path}: damaged: {prefix}features of valid patches are not unit vectors")
+    if "reference.rgb" in tensors and tensors["reference.focal"].min() <= 0:
+        raise ValueError(f"{path}: damaged: the photo's camera has a focal length that is not positive")
 
 
 def _read_tensors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -158,7 +214,9 @@ def _read_tensors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         raise ValueError(f"{path}: not an object file, or a damaged one ({str(error).splitlines()[0]})") from None
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
-    for name in ("rotation", "translation", "focal", "centre", "extents", "axes", "mean", "basis", "surface.points"):
+    placed = ("rotation", "translation", "focal", "centre")
+    needed = (*placed, "extents", "axes", "mean", "basis", "surface.points", *(f"reference.{name}" for name in placed))
+    for name in needed:
         if name in tensors and not np.isfinite(tensors[name]).all():
             raise ValueError(f"{path}: damaged: {name} has values that are not finite")
     return header, tensors
@@ -172,7 +230,7 @@ def _parse_header(text: str, path: Path) -> dict[str, Any]:
     version = header.get("format") if isinstance(header, dict) else None
     if not isinstance(version, int):
         raise ValueError(f"{path}: damaged: its description has no format version")
-    if version != FORMAT:
+    if version not in READABLE:
         advice = "a newer ipjax wrote it; upgrade ipjax" if version > FORMAT else "onboard the object again"
         raise ValueError(f"{path}: object file of format {version}, but this ipjax reads format {FORMAT}: {advice}")
     return header

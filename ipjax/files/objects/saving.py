@@ -11,7 +11,7 @@ from ipjax.files.objects.layout import FORMAT, OPTIONAL_TENSORS, TEMPLATE_TENSOR
 from ipjax.files.objects.pictures import compress_pictures
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import writing
-from ipjax.records import Templates
+from ipjax.records import ReferenceView, Templates
 
 
 def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
@@ -22,7 +22,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         templates: of one object, not batched. Features are stored as float16.
 
     Raises:
-        ValueError: the templates are no single object's, or hold numbers that are not finite.
+        ValueError: the templates are no single object's, or hold numbers that are not finite, or colours that are
+            not in [0, 1].
         OSError: the file cannot be written.
     """
     from safetensors.numpy import save_file
@@ -53,8 +54,10 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
         tensors |= {
             "appearance.points": templates.appearance.points,
             "appearance.normals": templates.appearance.normals,
-            "appearance.colours": np.round(255 * np.asarray(templates.appearance.colours)),
+            "appearance.colours": _to_bytes("appearance.colours", templates.appearance.colours),
         }
+    if templates.reference is not None:
+        tensors |= _flatten_reference(templates.reference)
     if np.ndim(patches.features) != 3:
         raise ValueError(
             f"templates of one object have features [views, patches, channels], not {patches.features.shape}"
@@ -101,6 +104,33 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
     with writing(path) as temporary:
         save_file(tensors, temporary, metadata={"ipjax": text})
     return path
+
+
+def _flatten_reference(reference: ReferenceView) -> dict[str, Any]:
+    """The photo that poses are found through, by the names of its tensors."""
+    view, patches, pose = reference.view, reference.patches, reference.camera_from_object
+    if not np.allclose(pose.scale, 1):
+        raise ValueError("the pose of the reference view must have scale 1")
+    return {
+        "reference.rgb": _to_bytes("reference.rgb", view.rgb),
+        "reference.depth": view.depth,
+        "reference.mask": view.mask,
+        "reference.features": patches.features,
+        "reference.points": patches.points,
+        "reference.grid": patches.grid,
+        "reference.valid": patches.valid,
+        "reference.rotation": pose.rotation,
+        "reference.translation": pose.translation,
+        "reference.focal": view.camera.focal,
+        "reference.centre": view.camera.centre,
+    }
+
+
+def _to_bytes(name: str, colours: Any) -> np.ndarray:
+    colours = np.asarray(colours)
+    if not ((colours >= 0) & (colours <= 1)).all():  # as bytes, what is outside would wrap around and NaN be anything
+        raise ValueError(f"{name} has values that are not in [0, 1]")
+    return np.round(255 * colours)
 
 
 def _version() -> str:

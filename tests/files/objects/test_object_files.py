@@ -6,22 +6,34 @@ import shutil
 import struct
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from builders.objects import make_object, nan, rewrite
+from builders.objects import make_object, nan, rewrite, with_reference
 
+from ipjax.files.objects.layout import FORMAT, OPTIONAL_TENSORS, hash_content
 from ipjax.files.objects.loading import check, load
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.objects.saving import save
+from ipjax.inference.batching import compact
 from ipjax.records import Appearance
+
+REFERENCE = {name for name in OPTIONAL_TENSORS if name.startswith("reference.")}
 
 
 @pytest.fixture
 def file(tmp_path):
     templates, info = make_object()
     return save(tmp_path / "mug.ipjax", templates, info)
+
+
+@pytest.fixture
+def photo_file(tmp_path):
+    """Of an object that was made from a photo without depth."""
+    templates, info = make_object()
+    return save(tmp_path / "photo.ipjax", with_reference(templates), info)
 
 
 def test_what_was_saved_comes_back(file):
@@ -52,6 +64,67 @@ def test_the_appearance_comes_back_to_the_digits_of_its_file(tmp_path):
     np.testing.assert_allclose(again.appearance.points, look.points, rtol=1e-3)
     np.testing.assert_allclose(again.appearance.normals, look.normals, rtol=1e-3)
     np.testing.assert_allclose(again.appearance.colours, look.colours, atol=0.5 / 255 + 1e-6)
+
+
+def test_the_reference_view_comes_back(photo_file, tmp_path):
+    wanted = with_reference(make_object()[0])
+    again, info = load(photo_file)
+    jax.tree.map(np.testing.assert_array_equal, wanted, again)
+    assert jax.tree.structure(wanted) == jax.tree.structure(again)
+    kinds = lambda tree: [x.dtype for x in jax.tree.leaves(tree)]
+    assert kinds(again) == kinds(wanted)
+    assert sum("poses are found through the photo: 28 pixels wide" in line for line in check(photo_file)) == 1
+    save(tmp_path / "again.ipjax", again, info)
+    assert (tmp_path / "again.ipjax").read_bytes() == photo_file.read_bytes()
+    plain = save(tmp_path / "plain.ipjax", *make_object())
+    assert load(plain)[0].reference is None and not any("through the photo" in line for line in check(plain))
+
+
+def test_compacted_templates_are_saved_beside_the_whole_photo(tmp_path):
+    templates, info = make_object(patches=16)
+    few = dataclasses.replace(templates.patches, valid=jnp.arange(16) < jnp.full((5, 1), 3))
+    small = compact(with_reference(dataclasses.replace(templates, patches=few)), multiple=4)
+    assert small.norm.shape == (5, 4)
+    again, _ = load(save(tmp_path / "small.ipjax", small, info))
+    jax.tree.map(np.testing.assert_array_equal, small, again)
+    assert again.reference is not None and again.reference.patches.valid.shape == (16,)
+
+
+def test_files_of_format_1_are_read(file):
+    """As an earlier ipjax wrote them: without a reference view, and with their own checksum."""
+    from safetensors.numpy import load_file
+
+    wanted, told = load(file)[0], check(file)
+    tensors = load_file(file)
+
+    def older(text):
+        header = json.loads(text) | {"format": 1}
+        return json.dumps(header | {"content_sha256": hash_content(header, tensors)})
+
+    rewrite(file, metadata=older)
+    found, _ = load(file)
+    jax.tree.map(np.testing.assert_array_equal, wanted, found)
+    assert found.reference is None
+    assert check(file) == [line.replace("format 2", "format 1") for line in told]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda r: eqx.tree_at(lambda r: r.view.depth, r, r.view.depth.at[0, 0].set(jnp.nan)), "reference.depth has"),
+        (lambda r: eqx.tree_at(lambda r: r.view.rgb, r, r.view.rgb.at[0, 0].set(jnp.nan)), "reference.rgb has"),
+        (lambda r: eqx.tree_at(lambda r: r.view.rgb, r, 255 * r.view.rgb), r"not in \[0, 1\]"),
+        (lambda r: eqx.tree_at(lambda r: r.camera_from_object.scale, r, jnp.asarray(2.0)), "must have scale 1"),
+        (lambda r: eqx.tree_at(lambda r: r.patches.features, r, r.patches.features[:, :3]), "reference.features is"),
+        (lambda r: eqx.tree_at(lambda r: r.view.rgb, r, r.view.rgb[:-1]), "not a usable object: reference.rgb is"),
+    ],
+)
+def test_a_reference_view_that_makes_no_sense_is_not_saved(spoil, words, tmp_path):
+    templates, info = make_object()
+    reference = spoil(with_reference(templates).reference)
+    with pytest.raises(ValueError, match=words):
+        save(tmp_path / "a.ipjax", dataclasses.replace(templates, reference=reference), info)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_basis_comes_back_and_must_fit(tmp_path):
@@ -141,6 +214,8 @@ HOSTILE = {
     "deep JSON": (lambda p: rewrite(p, metadata=lambda _: "[" * 100_000), "nested too deeply"),
     "no version": (lambda p: rewrite(p, metadata=lambda _: "{}"), "no format version"),
     "future version": (lambda p: rewrite(p, metadata=edit(format=99)), "upgrade"),
+    "next version": (lambda p: rewrite(p, metadata=edit(format=FORMAT + 1)), f"format {FORMAT + 1}, but .* upgrade"),
+    "no such version": (lambda p: rewrite(p, metadata=edit(format=0)), "onboard the object again"),
     "no mesh": (lambda p: rewrite(p, metadata=edit(mesh=None)), "lacks"),
     "scale 0": (lambda p: rewrite(p, metadata=edit(mesh={"scale": 0, "centre": [0, 0, 0]})), "lacks"),
     "missing tensor": (lambda p: rewrite(p, drop=["points"]), "points is missing"),
@@ -167,6 +242,83 @@ def test_hostile_files_are_refused_in_one_sentence(name, file):
         with pytest.raises(ValueError, match=words) as caught:
             read(file)
         assert str(file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+HOSTILE_PHOTOS = {
+    "missing tensor": (lambda p: rewrite(p, drop=["reference.grid"]), "not an object file: reference.grid is missing"),
+    "only one tensor": (lambda p: rewrite(p, drop=REFERENCE - {"reference.rgb"}), "reference.centre is missing"),
+    "no colours": (lambda p: rewrite(p, drop=["reference.rgb"]), "reference.rgb is missing"),
+    "not square": (lambda p: rewrite(p, change={"reference.mask": np.ones((28, 27), bool)}), "reference.mask is bool"),
+    "other size": (
+        lambda p: rewrite(p, change={"reference.depth": np.ones((14, 14), np.float32)}),
+        "usable object: reference",
+    ),
+    "no patches": (
+        lambda p: rewrite(
+            p, change={f"reference.{name}": lambda x: x[:0] for name in ("features", "points", "grid", "valid")}
+        ),
+        "not a usable object: reference",
+    ),
+    "other features": (
+        lambda p: rewrite(p, change={"reference.features": lambda f: f[:, :3]}),
+        "reference.features is",
+    ),
+    "wrong type": (lambda p: rewrite(p, change={"reference.rgb": lambda x: x.astype(np.float32)}), "reference.rgb is"),
+    "NaN pose": (
+        lambda p: rewrite(p, change={"reference.rotation": nan}),
+        "reference.rotation has values that are not",
+    ),
+    "NaN place": (lambda p: rewrite(p, change={"reference.translation": nan}), "reference.translation has"),
+    "NaN camera": (lambda p: rewrite(p, change={"reference.focal": nan}), "reference.focal has"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE_PHOTOS)
+def test_hostile_reference_views_are_refused_in_one_sentence(name, photo_file):
+    spoil, words = HOSTILE_PHOTOS[name]
+    spoil(photo_file)
+    for read in (load, check):
+        with pytest.raises(ValueError, match=words) as caught:
+            read(photo_file)
+        assert str(photo_file) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def rewrite_whole(path, change):
+    """Alter tensors, and the checksum with them."""
+    from safetensors.numpy import load_file
+
+    rewrite(path, change=change)
+    tensors = load_file(path)
+    rewrite(path, metadata=lambda text: edit(content_sha256=hash_content(json.loads(text), tensors))(text))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"reference.rotation": lambda r: 2 * r}, "the photo's pose holds something that is no rotation"),
+        ({"reference.rotation": lambda r: -r}, "the photo's pose holds something that is no rotation"),
+        ({"reference.features": lambda f: 2 * f}, "reference.features of valid patches are not unit vectors"),
+        ({"reference.valid": lambda v: v & False}, "the photo does not show any patch"),
+        ({"reference.focal": lambda f: -f}, "the photo's camera has a focal length that is not positive"),
+        ({"reference.depth": nan}, "reference.depth has values that are not finite"),
+        ({"rotation": lambda r: 2 * r}, "the template poses hold something that is no rotation"),
+        ({"features": lambda f: 2 * f}, "damaged: features of valid patches are not unit vectors"),
+        ({"valid": lambda v: v & False}, "no template shows any patch"),
+    ],
+)
+def test_check_finds_what_cannot_be_true(change, words, photo_file):
+    rewrite_whole(photo_file, change)
+    with pytest.raises(ValueError, match=words):
+        check(photo_file)
+
+
+def test_an_appearance_without_normals_is_refused(tmp_path):
+    templates, info = make_object()
+    look = dataclasses.replace(templates, appearance=Appearance(*(jnp.ones((4, 3)) for _ in range(3))))
+    path = save(tmp_path / "a.ipjax", look, info)
+    rewrite(path, drop=["appearance.normals"])
+    with pytest.raises(ValueError, match=r"appearance\.normals is missing"):
+        load(path)
 
 
 @pytest.mark.parametrize(

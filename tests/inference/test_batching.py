@@ -1,0 +1,82 @@
+"""Objects padded to one size: those from photos without depth keep the view through which their pose is found."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+from builders.objects import make_object, with_reference
+from builders.tiny_pipeline import TINY
+
+import ipjax
+from ipjax.inference.exporting import estimate_dictionaries, to_dictionary
+from ipjax.synthetic import problems
+
+
+def two_photos():
+    """Two objects from photos, of more and fewer views; the photos are of one size."""
+    return [with_reference(make_object(views=views, seed=views)[0], seed=views) for views in (5, 3)]
+
+
+def test_reference_views_are_stacked():
+    objects = two_photos()
+    padded = ipjax.pad_templates(objects)
+    assert padded.norm.shape == (2, 5, 4) and padded.reference.view.rgb.shape == (2, 28, 28, 3)
+    assert padded.reference.patches.encoder == padded.patches.encoder == "dinov2 vits14 block=8"
+    for index, one in enumerate(objects):
+        found = jax.tree.map(lambda x, index=index: x[index], padded.reference)
+        jax.tree.map(np.testing.assert_array_equal, found, one.reference)
+    unnamed = dataclasses.replace(objects[1], patches=dataclasses.replace(objects[1].patches, encoder=None))
+    assert ipjax.pad_templates([objects[0], unnamed]).reference.patches.encoder == "dinov2 vits14 block=8"
+
+
+def test_compact_leaves_the_reference_view_whole():
+    templates = problems.make_templates()
+    whole = with_reference(templates, side=112)
+    small = ipjax.compact(whole, multiple=8)
+    assert small.norm.shape[1] < whole.norm.shape[1]
+    jax.tree.map(np.testing.assert_array_equal, small.reference, whole.reference)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: dataclasses.replace(t, reference=None), "from a photo without depth, .* and some were not"),
+        (lambda t: with_reference(t, side=14), r"differ in size, \[14, 14\] pixels .* \[28, 28\] pixels"),
+        (
+            lambda t: dataclasses.replace(t, reference=with_reference(make_object(patches=6, seed=1)[0]).reference),
+            "differ in size, .* with 4 patches and .* with 6 patches",
+        ),
+        (
+            lambda t: dataclasses.replace(
+                t,
+                reference=dataclasses.replace(
+                    t.reference, patches=dataclasses.replace(t.reference.patches, encoder="b")
+                ),
+            ),
+            "different encoders: 'b', 'dinov2",
+        ),
+    ],
+)
+def test_reference_views_that_are_not_alike_are_not_padded(change, message):
+    first, second = two_photos()
+    with pytest.raises(ValueError, match=message):
+        ipjax.pad_templates([first, change(second)])
+
+
+def test_an_exported_graph_takes_the_reference_view(monkeypatch):
+    """It goes through the dictionaries of an exported estimate and is whole again where the estimate is made."""
+    templates = with_reference(problems.make_templates(), side=112)
+    query, _ = problems.make_query(0)
+    given = []
+
+    def estimate(encoder, templates, query, key, config):
+        given.append(templates)
+        return query
+
+    monkeypatch.setattr("ipjax.inference.exporting.estimate", estimate)
+    key = jax.random.key_data(jax.random.key(0))
+    for one in (templates, dataclasses.replace(templates, reference=None)):
+        found = estimate_dictionaries(to_dictionary(one), to_dictionary(query), key, TINY)
+        jax.tree.map(np.testing.assert_array_equal, given[-1], one)
+        jax.tree.map(np.testing.assert_array_equal, found, to_dictionary(query))
