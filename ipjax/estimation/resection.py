@@ -10,6 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from ipjax_kernels.consensus import draw_minimal_sets
 from ipjax_kernels.perspective import refine_resection, weak_perspective
 from ipjax_kernels.positive import root
@@ -58,16 +59,17 @@ def measure_sight(reference: ReferenceView, query: Query) -> Sight:
 
 
 def match_photo(
-    query: Query, templates: Templates, config: ResectConfig, matching: MatchConfig
+    templates: Templates, query: Query, cycle: Float[Array, ""] | float, config: ResectConfig
 ) -> tuple[Matches, Pairs]:
     """The views of the object that look most like the query by what the photo showed, and their pairs.
 
     Args:
       query: its patches centred on the templates' mean, as the templates' are.
+      cycle: the longest of a pair, patches.
     """
     shown = templates.patches.valid & (templates.seen > 0.5)
     seen = eqx.tree_at(lambda t: t.patches.valid, templates, shown)
-    matching = eqx.tree_at(lambda m: m.cycle, MatchConfig(views=config.views, pairs=config.pairs), matching.cycle)
+    matching = eqx.tree_at(lambda m: m.cycle, MatchConfig(views=config.views, pairs=config.pairs), cycle)
     matches = match(query.patches, seen, matching)
     return matches, select(matches, query.patches, templates, matching)
 
@@ -90,7 +92,7 @@ def patch_normals(cloud: Cloud, rows: int, columns: int) -> Float[Array, "p 3"]:
     normals = normals / jnp.maximum(root(jnp.sum(normals**2, axis=-1, keepdims=True)), 1e-12)
     normals = jnp.where(whole[..., None], normals, 0)
     side = cloud.valid.shape[0]
-    at = lambda count: jnp.round((jnp.arange(count) + 0.5) * side / count - 0.5).astype(jnp.int32)
+    at = lambda count: np.round((np.arange(count) + 0.5) * side / count - 0.5).astype(np.int32)
     return normals[at(rows)[:, None], at(columns)[None]].reshape(-1, 3)
 
 
@@ -185,13 +187,13 @@ def _distinct(
 class Drawing(eqx.Module):
     """The query as the photo's camera sees it from a candidate pose, compared with the photo."""
 
-    overlap: Float[Array, ""]  # mean cosine of the patches that both cover
-    colour: Float[Array, ""]  # correlation of their colours, in [-1, 1]
-    shared: Float[Array, ""]  # share of the photo's outline that both cover
-    points: Float[Array, "p 3"]  # of the query, metres, behind each patch of the photo
-    rays: Float[Array, "p 2"]  # where the photo shows what the drawing shows in that patch
-    weight: Float[Array, "p"]
-    depth: Float[Array, "h w"]  # metres
+    overlap: Float[Array, "*b"]  # mean cosine of the patches that both cover
+    colour: Float[Array, "*b"]  # correlation of their colours, in [-1, 1]
+    shared: Float[Array, "*b"]  # share of the photo's outline that both cover
+    points: Float[Array, "*b p 3"]  # of the query, metres, behind each patch of the photo
+    rays: Float[Array, "*b p 2"]  # where the photo shows what the drawing shows in that patch
+    weight: Float[Array, "*b p"]
+    depth: Float[Array, "*b h w"]  # metres
 
 
 def splat_query(
@@ -238,7 +240,7 @@ def draw_query(
     outline = mean(reference.view.mask.astype(depth.dtype))[:, 0]
     photo = jnp.where(reference.patches.valid[:, None], reference.patches.features, 0).astype(features.dtype)
     cosine = jnp.sum(features * photo, axis=-1)
-    shared = jnp.minimum(cover, outline) * reference.patches.valid
+    shared = jnp.where(reference.patches.valid, jnp.minimum(cover, outline), 0)
     overlap = jnp.sum(cosine * shared) / jnp.maximum(jnp.sum(shared), 1e-6)
     # Nearby, every patch of the photo is compared, and the place is the mean of those that are most alike.
     grid = reference.patches.grid
@@ -265,31 +267,54 @@ def draw_query(
     )
 
 
-def polish(
+class Compared(eqx.Module):
+    """The candidates after their drawings were compared with the photo, each with its best drawing."""
+
+    rotation: Float[Array, "*b 3 3"]
+    translation: Float[Array, "*b 3"]
+    drawing: Drawing  # an overlap of -1 = absent
+
+
+def compare_drawings(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
     templates: Templates,
     query: Query,
-    start: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+    found: Resections,
     sight: Sight,
     config: ResectConfig,
-) -> tuple[tuple[Float[Array, "3 3"], Float[Array, "3"]], Drawing]:
-    """A candidate refined on what its own drawing matches, ``config.rounds`` times, and the drawing of the best one."""
+) -> Compared:
+    """Draw every candidate; then refine the ``config.polished`` best on what their drawings match, and draw them again,
+    ``config.rounds`` times. Of each candidate the pose whose drawing overlaps best remains.
 
-    def one_round(state, _):
-        pose, best_pose, best = state
-        drawn = draw_query(encoder, templates, query, *pose, sight, config)
-        better = drawn.overlap > best.overlap
-        choose = lambda new, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
-        found = refine_resection(
-            *pose, drawn.points, drawn.rays, drawn.weight, config.width * sight.diagonal, steps=config.steps
+    One loop whose body draws one candidate: the encoder is compiled once.
+    """
+    count = found.support.shape[0]
+    polished = min(config.polished, count)
+    blank = jax.eval_shape(lambda turn, shift: draw_query(encoder, templates, query, turn, shift, sight, config),
+                           found.rotation[0], found.translation[0])  # fmt: skip
+    blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), blank)
+    blank = eqx.tree_at(lambda d: d.overlap, blank, jnp.full(count, -1, blank.overlap.dtype))
+    width = config.width * sight.diagonal
+
+    def step(index, state):
+        turns, shifts, first, best = state
+        order = lax.top_k(first, polished)[1]
+        one = jnp.where(index < count, index, order[(index - count) % polished])
+        drawn = draw_query(encoder, templates, query, turns[one], shifts[one], sight, config)
+        drawn = eqx.tree_at(lambda d: d.overlap, drawn, jnp.where(found.support[one] >= 0, drawn.overlap, -1))
+        first = first.at[one].set(jnp.where(index < count, drawn.overlap, first[one]))
+        here = Compared(turns[one], shifts[one], drawn)
+        better = drawn.overlap > best.drawing.overlap[one]
+        best = jax.tree.map(
+            lambda all_of_them, new: all_of_them.at[one].set(jnp.where(better, new, all_of_them[one])), best, here
         )
-        return ((found.rotation, found.translation), choose(pose, best_pose), choose(drawn, best)), drawn.overlap
+        fit = refine_resection(
+            turns[one], shifts[one], drawn.points, drawn.rays, drawn.weight, width, steps=config.steps
+        )
+        return turns.at[one].set(fit.rotation), shifts.at[one].set(fit.translation), first, best
 
-    empty = jax.eval_shape(lambda: draw_query(encoder, templates, query, *start, sight, config))
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), empty)
-    empty = eqx.tree_at(lambda d: d.overlap, empty, -jnp.ones_like(empty.overlap))
-    (_, pose, drawn), _ = lax.scan(one_round, (start, start, empty), None, length=config.rounds + 1)
-    return pose, drawn
+    start = found.rotation, found.translation, blank.overlap, Compared(found.rotation, found.translation, blank)
+    return lax.fori_loop(0, count + polished * config.rounds, step, start)[3]
 
 
 def metres_per_unit(

@@ -18,11 +18,11 @@ from ipjax.config import Config
 from ipjax.estimation.confidence import find_rival, probability, rotation_ambiguity
 from ipjax.estimation.features import object_features
 from ipjax.estimation.resection import (
+    compare_drawings,
     match_photo,
     measure_sight,
     metres_per_unit,
     patch_normals,
-    polish,
     query_from_object,
     rays_of,
     resect,
@@ -37,10 +37,10 @@ def estimate_through_photo(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
     templates: Templates,
     query: Query,
-    key: PRNGKeyArray,
-    config: Config,
-    diameter: Float[Array, ""] | None,
     usable: Bool[Array, ""],
+    key: PRNGKeyArray,
+    config: Config = Config(),
+    diameter: Float[Array, ""] | None = None,
 ) -> PoseEstimate:
     """:func:`ipjax.estimate` of an object whose templates have a reference view.
 
@@ -54,7 +54,7 @@ def estimate_through_photo(
     query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
     sight = measure_sight(reference, query)
     with jax.named_scope("match"):
-        matches, pairs = match_photo(query, templates, resection, config.match)
+        matches, pairs = match_photo(templates, query, config.match.cycle, resection)
         rays = rays_of(reference, pairs.object)
     scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
     side = round(query.patches.valid.shape[0] ** 0.5)
@@ -72,14 +72,11 @@ def estimate_through_photo(
             overlap = colour = shared = jnp.ones_like(found.support)
             score = found.support
         else:
-            refine = lambda pose: polish(encoder, templates, query, pose, sight, resection)
-            # One image at a time is fastest on a CPU; accelerators want them all.
-            camera, drawn = lax.platform_dependent(
-                (found.rotation, found.translation), cpu=lambda x: lax.map(refine, x), default=jax.vmap(refine)
-            )
+            compared = compare_drawings(encoder, templates, query, found, sight, resection)
+            camera, drawn = (compared.rotation, compared.translation), compared.drawing
             points, where, weight = drawn.points, drawn.rays, drawn.weight
             depth, overlap, colour, shared = drawn.depth, drawn.overlap, drawn.colour, drawn.shared
-            score = jnp.where(found.support >= 0, overlap, -1)
+            score = overlap
         typical = sight.query_extent / sight.extent  # the distance of the photo's camera, metres
         fallback = typical / reference.camera_from_object.translation[2]
         units, front = jax.vmap(lambda one: metres_per_unit(reference, one, fallback))(depth)

@@ -3,8 +3,10 @@
 import dataclasses
 import os
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from ipjax.config import DescribeConfig, OnboardConfig
-from ipjax.estimation.features import centre, check_cut, cut, describe, principal_basis
+from ipjax.estimation.features import centre, check_cut, cut, describe, identity_of, principal_basis
 from ipjax.files.meshes.cleaning import clean
 from ipjax.files.meshes.loading import load_mesh
 from ipjax.files.meshes.mesh import Mesh, normalise
@@ -22,11 +24,10 @@ from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.files.weights.hashes import hash_file
-from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.photo_views import PhotoSource, ReferencePhoto, photo_poses, put_photo
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.progress import bar
-from ipjax.records import Appearance, Camera, Patches, ReferenceView, Similarity, Surface, Templates, View
+from ipjax.records import UNNAMED, Appearance, Camera, Patches, ReferenceView, Similarity, Surface, Templates, View
 from ipjax.rendering.render import render
 
 _CORNERS = 3000  # of a convex hull, among which its smallest box is sought
@@ -99,7 +100,7 @@ def make_appearance(mesh: Mesh, count: int) -> Appearance:
 
 def make_templates(
     mesh: Mesh,
-    encoder: Encoder,
+    encoder: Callable[..., Any],
     config: OnboardConfig = OnboardConfig(),
     *,
     photo: PhotoSource | None = None,
@@ -196,7 +197,7 @@ def make_templates(
 
 
 def _describe(
-    encoder: Encoder, view: View, camera_from_object: Similarity, surface: Surface, config: DescribeConfig
+    encoder: Callable[..., Any], view: View, camera_from_object: Similarity, surface: Surface, config: DescribeConfig
 ) -> tuple[Patches, Float[Array, "p"]]:
     """The patches of one template in the object's frame, and the share of the surface under each that was seen."""
     patches = describe(encoder, view, config)
@@ -214,7 +215,7 @@ _describe_view = jax.jit(_describe)
 
 def onboard(
     source: str | Path | Mesh,
-    encoder: Encoder | None = None,
+    encoder: Callable[..., Any] | None = None,
     config: OnboardConfig = OnboardConfig(),
     *,
     out: str | Path | None = None,
@@ -228,7 +229,8 @@ def onboard(
 
     Args:
       source: a mesh file (OBJ, PLY, GLB, glTF, STL) or a ``Mesh``.
-      encoder: default: the best weights on this machine (``load_encoder()``).
+      encoder: default: the best weights on this machine (``load_encoder()``); or one of your own, as ``describe``
+        takes it: a pytree, with an ``identity`` if it is to be told from others.
       out: also write the object file.
       name: default: the file's.
       metres_per_unit: the mesh file's unit, where it is known; then the object's size is, too.
@@ -248,7 +250,7 @@ def onboard(
     textured = None if mesh.texture is None or mesh.uv is None else (mesh.texture, mesh.uv)
     info = ObjectInfo(
         name=name or (path.stem if path else "object"),
-        encoder=encoder.identity,
+        encoder=identity_of(encoder) or UNNAMED,
         mesh_scale=mesh.scale,
         mesh_centre=mesh.centre,
         mesh_file=path.name if path else "",

@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,6 @@ from ipjax.files.objects.saving import save
 from ipjax.files.weights.hashes import hash_file
 from ipjax.inference.cutting import undistort_frame
 from ipjax.inference.depth import check_depth_unit, find_depth_scale, sample_depth, to_metres
-from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo
 from ipjax.onboarding.mesh import onboard
 from ipjax.onboarding.photo_views import ReferencePhoto
@@ -56,7 +55,7 @@ class PreparedPhoto:
 
 def onboard_photo(
     source: str | Path | Photo,
-    encoder: Encoder | None = None,
+    encoder: Callable[..., Any] | None = None,
     config: OnboardConfig = OnboardConfig(),
     *,
     mask: Any = None,

@@ -68,20 +68,20 @@ def photo_poses(photo: PhotoSource) -> Similarity[np.ndarray]:
 
 
 def turn_photo(
-    photo: PhotoSource, pose: Similarity[np.ndarray], camera: Camera, resolution: int
+    photo: PhotoSource, pose: Similarity[np.ndarray], matrix: Float[np.ndarray, "3 3"], resolution: int
 ) -> tuple[UInt8[np.ndarray, "s s 3"], Bool[np.ndarray, "s s"]]:
     """The photo as a camera in its place sees it that was turned: colours, black outside the mask, and the mask.
 
     Args:
       pose: of the object in the turned camera, from the same place.
-      camera: the turned one's, of ``resolution`` pixels on a side.
+      matrix: K of the turned one, of ``resolution`` pixels on a side.
     """
     import cv2
 
     fine = 3  # samples on a side of each pixel
     camera_from_turned = photo.camera_from_object.rotation @ pose.rotation.T
     size = (resolution, resolution)
-    matrix = resize(camera.to_matrix(), size, (fine * resolution, fine * resolution))
+    matrix = resize(matrix, size, (fine * resolution, fine * resolution))
     homography = turn(photo.matrix, camera_from_turned, matrix)
     warp = lambda image: cv2.resize(
         cv2.warpPerspective(
@@ -105,11 +105,10 @@ def turn_photo(
 def put_photo(views: Renders, photo: PhotoSource, poses: Similarity[np.ndarray], first: int) -> Renders:
     """The drawings with the photo itself in place of its ``ROLLS`` views, from ``first`` on; depth stays the mesh's."""
     rgb, depth = np.array(views.rgb), np.array(views.depth)
-    resolution = rgb.shape[1]
+    resolution, matrices = rgb.shape[1], views.camera.to_matrix()
     for index in range(first, first + ROLLS):
         pose = Similarity(poses.rotation[index], poses.translation[index], poses.scale[index])
-        camera = Camera(views.camera.focal[index], views.camera.centre[index])
-        image, mask = turn_photo(photo, pose, camera, resolution)
+        image, mask = turn_photo(photo, pose, matrices[index], resolution)
         depth[index] = np.where(mask, depth[index], 0)
         rgb[index] = np.where(depth[index][..., None] > 0, image, 0)
     return dataclasses.replace(views, rgb=rgb, depth=depth)

@@ -102,10 +102,17 @@ class Frame:
     camera_from_object: Similarity
 
 
-def make_frame(seed: int, height: int = 480, width: int = 640, share: tuple[float, float] = (0.25, 0.5)) -> Frame:
+def make_frame(
+    seed: int,
+    height: int = 480,
+    width: int = 640,
+    share: tuple[float, float] = (0.25, 0.5),
+    rotation: Float[np.ndarray, "3 3"] | None = None,
+) -> Frame:
     """An exact image of the ellipsoid before a wall, at a random pose, size and place, by a random camera.
 
-    ``share``: of the image's height that the diameter takes, smallest and largest.
+    ``share``: of the image's height that the diameter takes, smallest and largest. ``rotation``: of the object, instead
+    of a random one.
     """
     rng = np.random.default_rng(seed)
     focal = rng.uniform(0.8, 1.2) * width * np.array([1, rng.uniform(0.99, 1.01)])
@@ -115,7 +122,7 @@ def make_frame(seed: int, height: int = 480, width: int = 640, share: tuple[floa
     room = 0.7 * wanted
     place = rng.uniform([room, room], [width - room, height - room])
     truth = Similarity(
-        jnp.asarray(random_rotation(rng), jnp.float32),
+        jnp.asarray(random_rotation(rng) if rotation is None else rotation, jnp.float32),
         jnp.asarray([*((place - centre) / focal * distance), distance], jnp.float32),
         jnp.asarray(scale, jnp.float32),
     )
