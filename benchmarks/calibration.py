@@ -31,6 +31,7 @@ PARTS = len(dataclasses.fields(Agreement))
 SOURCES = {"scan": "their mesh", "rgbd": "one RGB-D photo", "rgb": "one photo"}
 SOURCES |= {f"level{k}": f"their mesh degraded to level {k}" for k in range(1, 5)}
 RIGHT = 0.1  # of the diameter: the mean distance of surface points below which a pose counts as right
+TURNED = 15.0  # degrees below which it does where the shape is guessed from a photo, and surface points say little
 
 
 def read(paths: list[Path]) -> list[dict]:
@@ -51,9 +52,19 @@ def split(rows: list[dict]) -> tuple[list[dict], list[dict]]:
     return [row for row in rows if row["key"][1] in fit], [row for row in rows if row["key"][1] not in fit]
 
 
+def from_photo(row: dict) -> bool:
+    """Whether the object was known from a photo without depth, and so found through the photo."""
+    return row["key"][0] == "rgb"
+
+
+def is_right(row: dict) -> bool:
+    """Whether the pose is right, for what was known of the object."""
+    return row["rotation"] < TURNED if from_photo(row) else row["add"] < RIGHT
+
+
 def cases(rows: list[dict], *, drawn: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The features of the regression [n 7], whether the pose is right [n], and whether the object was present [n]."""
-    found = [(row["agreement"], row["add"] < RIGHT, True) for row in rows]
+    found = [(row["agreement"], is_right(row), True) for row in rows]
     found += [(row["absent"]["agreement"], False, False) for row in rows if "agreement" in row.get("absent", {})]
     parts = np.array([agreement for agreement, _, _ in found])
     logs = np.log(np.clip(parts[:, :3], 1e-3, 1))
@@ -119,7 +130,7 @@ def reliability(chance: np.ndarray, right: np.ndarray, bins: int = 10) -> tuple[
 
 def mahalanobis_lengths(rows: list[dict], config: ConfidenceConfig) -> tuple[np.ndarray, np.ndarray]:
     """Squared Mahalanobis lengths of right poses, and their errors of scale in standard deviations (free scales)."""
-    good = [row for row in rows if row["add"] < RIGHT]
+    good = [row for row in rows if is_right(row)]
     factor = [config.independent / row["independent"] for row in good]
     squared = np.array([row["squared_mahalanobis"] * f for row, f in zip(good, factor, strict=True)])
     free = [row["scale_deviations"] * f**0.5 for row, f in zip(good, factor, strict=True) if row["scale_free"]]
@@ -133,6 +144,12 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="write the page here, without .md and .png")
     options = parser.parse_args()
     rows = read(options.results)
+    photos = [row for row in rows if from_photo(row)]
+    if photos:
+        judge_photos(*split(photos))
+    rows = [row for row in rows if not from_photo(row)]
+    if not rows:
+        return
     fit, held = split(rows)
     now = ConfidenceConfig()
     as_text = lambda weights: "(" + ", ".join(f"{w:.2f}" for w in weights) + ")"
@@ -151,6 +168,24 @@ def main() -> None:
         diagram = f"\n![reliability diagram]({options.page.name}.png)\n"
         write_text(options.page.with_suffix(".md"), text + diagram)
         draw(picture, options.page.with_suffix(".png"))
+
+
+def judge_photos(fit: list[dict], held: list[dict]) -> None:
+    """Print what fits objects from photos without depth best, and how far the present numbers can be trusted."""
+    ridge = choose_ridge(fit)
+    weights = fit_logistic(*cases(fit)[:2], ridge, SIGNS)
+    print(f"best for the {len({r['key'][1] for r in fit})} objects from photos to fit:")
+    print(f"  photo = ({', '.join(f'{w:.2f}' for w in weights)}), shrunk by {ridge:g}")
+    for name, chosen in (("now", ConfidenceConfig().photo), ("as fitted", weights)):
+        features, right, present = cases(held)
+        chance = chances(features, chosen)
+        called = present & (chance >= ConfidenceConfig().least)
+        print(
+            f"  {name}: of {called.sum()} of {present.sum()} called present, {right[called].mean():.0%} were turned by "
+            f"less than {TURNED:g}°; absent ones called present: {(chance[~present] >= 0.5).sum()} of "
+            f"{(~present).sum()}; expected calibration error {reliability(chance, right)[0]:.3f}"
+        )
+    print()
 
 
 def page(held: list[dict], config: ConfidenceConfig) -> tuple[str, list[tuple[float, float, int]]]:

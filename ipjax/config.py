@@ -172,7 +172,7 @@ PRESETS = ("default", "fast", "paper")
 
 
 class OnboardConfig(eqx.Module):
-    """From a mesh to templates."""
+    """From a mesh to templates; one from a photo without depth has the photo's views (`onboarding.photo_views`)."""
 
     directions: int = _static(40, least=1)  # viewpoints on the Fibonacci sphere
     rolls: int = _static(10, least=1)  # in-plane rotations of each; 40 × 10 is the paper's 400

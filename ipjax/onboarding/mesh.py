@@ -110,7 +110,8 @@ def make_templates(
     """Render and describe a normalised mesh.
 
     Args:
-      photo: the one without depth that the mesh was made from; its views follow the others.
+      photo: the one without depth that the mesh was made from. The templates are then its views, whatever
+        ``config.directions`` and ``config.rolls``: what it did not show, nobody knows.
 
     Returns:
       The templates, and their images ``[v resolution resolution 3]`` uint8 for pictures.
@@ -124,15 +125,15 @@ def make_templates(
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
     axes = box_axes(mesh.vertices[used])  # first: it refuses what has no shape
-    poses, first = viewpoints(config.directions, config.rolls, distance=config.distance), 0
-    if photo is not None:
-        first = len(poses.scale)
-        poses = jax.tree.map(lambda *x: jnp.concatenate(x), poses, photo_poses(photo).to_jax())
+    if photo is None:
+        poses = viewpoints(config.directions, config.rolls, distance=config.distance)
+    else:
+        poses = photo_poses(photo).to_jax()
     cameras = framing_cameras(mesh.vertices, poses, config.resolution, config.fill)
     views = render(mesh, poses, cameras, config.resolution, config.resolution, backend=backend, progress=progress)
     views = dataclasses.replace(views, camera=jax.tree.map(np.asarray, cameras))
     if photo is not None:
-        views = put_photo(views, photo, poses.to_numpy(), first)
+        views = put_photo(views, photo, poses.to_numpy())
     surface = Surface(*(jnp.asarray(x, jnp.float32) for x in sample_surface(mesh, config.surface, seed=0)))
     poses_on_host = jax.tree.map(np.asarray, poses)  # slicing a JAX array by a Python number compiles once per number
 
@@ -167,7 +168,7 @@ def make_templates(
         features, kept = jax.jit(cut)(patches.features, basis)
         patches = dataclasses.replace(patches, features=features.astype(patches.features.dtype))
         norm = norm * kept
-    at_photo = lambda tree: jax.tree.map(lambda x: x[first], tree)
+    first = lambda tree: jax.tree.map(lambda x: x[0], tree)
     templates = Templates(
         patches=patches,
         basis=basis,
@@ -184,13 +185,13 @@ def make_templates(
         if photo is None
         else ReferenceView(
             view=View(
-                rgb=jnp.asarray(views.rgb[first].astype(np.float32) / 255),
-                depth=jnp.asarray(views.depth[first]),
-                mask=jnp.asarray(views.mask[first]),
-                camera=at_photo(cameras),
+                rgb=jnp.asarray(views.rgb[0].astype(np.float32) / 255),
+                depth=jnp.asarray(views.depth[0]),
+                mask=jnp.asarray(views.mask[0]),
+                camera=first(cameras),
             ),
-            patches=at_photo(patches),
-            camera_from_object=at_photo(poses),
+            patches=first(patches),
+            camera_from_object=first(poses),
         ),
     )
     return templates, views.rgb

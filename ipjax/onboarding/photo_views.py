@@ -102,11 +102,11 @@ def turn_photo(
     return np.round(np.clip(rgb, 0, 255)).astype(np.uint8), mask
 
 
-def put_photo(views: Renders, photo: PhotoSource, poses: Similarity[np.ndarray], first: int) -> Renders:
-    """The drawings with the photo itself in place of its ``ROLLS`` views, from ``first`` on; depth stays the mesh's."""
+def put_photo(views: Renders, photo: PhotoSource, poses: Similarity[np.ndarray]) -> Renders:
+    """The drawings with the photo itself in place of the first ``ROLLS``; depth stays the mesh's."""
     rgb, depth = np.array(views.rgb), np.array(views.depth)
     resolution, matrices = rgb.shape[1], views.camera.to_matrix()
-    for index in range(first, first + ROLLS):
+    for index in range(ROLLS):
         pose = Similarity(poses.rotation[index], poses.translation[index], poses.scale[index])
         image, mask = turn_photo(photo, pose, matrices[index], resolution)
         depth[index] = np.where(mask, depth[index], 0)

@@ -92,8 +92,8 @@ def test_patches_of_an_object_from_a_photo_know_their_place_in_it():
     )
     templates, reference = made.templates, made.templates.reference
     assert reference is not None
-    assert len(templates.camera_from_object.scale) == 2 + ROLLS + TILTS * TILT_ROLLS
-    np.testing.assert_array_equal(reference.camera_from_object.rotation, templates.camera_from_object.rotation[2])
+    assert len(templates.camera_from_object.scale) == ROLLS + TILTS * TILT_ROLLS
+    np.testing.assert_array_equal(reference.camera_from_object.rotation, templates.camera_from_object.rotation[0])
     # The photo's pixel of each patch: its centre, seen through the turned camera.
     valid = np.asarray(reference.patches.valid)
     patch = 112 / 8
