@@ -181,7 +181,7 @@ def judge_photos(fit: list[dict], held: list[dict]) -> None:
         chance = chances(features, chosen)
         called = present & (chance >= ConfidenceConfig().least)
         print(
-            f"  {name}: of {called.sum()} of {present.sum()} called present, {right[called].mean():.0%} were turned by "
+            f"  {name}: {called.sum()} of {present.sum()} called present, {(called & right).sum()} of them turned by "
             f"less than {TURNED:g}°; absent ones called present: {(chance[~present] >= 0.5).sum()} of "
             f"{(~present).sum()}; expected calibration error {reliability(chance, right)[0]:.3f}"
         )

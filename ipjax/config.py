@@ -104,7 +104,7 @@ class ResectConfig(eqx.Module):
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn
     guess: float = 0.1  # standard deviation of the guessed distance from the front to the centre, in diameters
-    independent: float = 20.0  # number of independent pairs
+    independent: float = 7.0  # number of independent pairs; fitted by ``python -m benchmarks.calibration``
 
 
 class ConfidenceConfig(eqx.Module):
@@ -112,7 +112,7 @@ class ConfidenceConfig(eqx.Module):
 
     drawn: tuple[float, ...] = (2.04, 0.94, 1.15, 2.37, 5.92, 0.0, -2.04)  # see ``confidence.probability``
     undrawn: tuple[float, ...] = (7.84, 1.51, 6.84, 0.0, 0.0, 1.23, -3.77)  # where no candidate was drawn
-    photo: tuple[float, ...] = (2.0, 0.0, 0.0, 10.0, 0.0, 0.0, -3.0)  # of objects from a photo without depth
+    photo: tuple[float, ...] = (6.7, 0.0, 2.59, 1.95, 7.69, 0.0, -4.81)  # of objects from a photo without depth
     least: float = 0.5  # confidence below which ``present`` is False
     independent: float = 9.84  # number of independent residuals of refinement
     pair_share: float = 0.0239  # share of the pairs that are independent
