@@ -21,7 +21,7 @@ def add(commands: Any) -> None:
         commands,
         "demo",
         run,
-        "render a scene, onboard a distorted copy of one of its objects, find it, and compare with the truth",
+        "render a scene, find one of its objects by a distorted copy and by one RGB photo, and compare with the truth",
         EXAMPLES,
     )
     options.add_output(parser, "FOLDER", "for the results", default=Path("ipjax-demo"))
@@ -31,7 +31,7 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
-    """Run the demo; returns the exit status, 1 where the object was not found."""
+    """Run the demo; returns the exit status, 1 where the object was not found by its distorted copy."""
     options.check_folder(arguments.output)
     options.check_seed(arguments.seed)
     from ipjax.inference.compilation_cache import use_compilation_cache
@@ -41,7 +41,15 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     use_compilation_cache()
     from ipjax.commands.demo_scene import run_demo
 
-    found = run_demo(arguments.output, encoder, seed=arguments.seed)
+    outcome = run_demo(arguments.output, encoder, seed=arguments.seed)
+    found, photo = outcome.mesh, outcome.photo
     good = found is not None and found.good
-    messages.finish({"folder": str(arguments.output), "found": good, **({} if found is None else found.as_json())})
+    messages.finish(
+        {
+            "folder": str(arguments.output),
+            "found": good,
+            **({} if found is None else found.as_json()),
+            "photo": None if photo is None else photo.as_json(),
+        }
+    )
     return 0 if good else 1
