@@ -24,7 +24,7 @@ PYTEST ?=
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make demo       find an object in a rendered scene; the picture goes to $(OUT)"
+	@echo "make demo       find an object in a rendered scene, by a mesh and by a photo; all goes to $(OUT)"
 	@echo "make test       lint, tests and notebooks (WORKERS=$(WORKERS) processes; PYTEST=\"-k name\" to choose)"
 	@echo "make lint       ruff and pyright"
 	@echo "make format     let ruff rewrite what it can"

@@ -15,6 +15,7 @@ examples:
   ipjax onboard scan.ply -o scan.ipjax --unit mm           the mesh's unit is known: sizes are compared in the result
   ipjax onboard part.stl -o part.ipjax --directions 20     half the templates: faster, less accurate
   ipjax onboard part.stl -o part.ipjax --set surface=4096  any other setting of onboarding
+  ipjax onboard mug.jpg -o mug.ipjax                       a photo of it before a plain background
   ipjax onboard mug.jpg --mask mug_mask.png -o mug.ipjax --report mug.html
   ipjax onboard mug.jpg --box 210,130,90,120 -o mug.ipjax  the mask is cut out inside the box
   ipjax onboard rgb.png --mask mask.png --depth depth.png --camera camera.json --depth-scale 0.001 -o mug.ipjax
@@ -22,7 +23,8 @@ examples:
 
 The mesh may be a scan, CAD, or what a single-view reconstruction made: in any frame and unit, coloured by a texture or
 by vertices. A photo becomes a mesh by TripoSR where its weights are, else without learned weights: its outline is
-inflated, or its depth completed. The report shows what was seen and what was guessed.
+inflated, or its depth completed. The report shows what was seen and what was guessed. An object from a photo without
+depth is found through that photo: its rotation does not rest on the guessed shape.
 """
 PHOTOS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}

@@ -1,13 +1,29 @@
-"""``ipjax demo``: what it compares, and what it refuses. The whole of it is what ``make demo`` runs."""
+"""``ipjax demo``: what it compares, tells and refuses. With real weights ``make demo`` runs the whole of it."""
+
+import dataclasses
+import functools
+import json
+import re
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.command_lines import run
+from builders.objects import make_object as make_onboarded
+from builders.tiny_dinov2 import tiny
+from builders.tiny_pipeline import TINY
+from flax import nnx
 
-from ipjax.commands.demo_scene import compare
-from ipjax.records import Similarity
+from ipjax.commands import demo_scene
+from ipjax.commands.demo_scene import compare, place_through_photo
+from ipjax.config import OnboardConfig, ResectConfig
+from ipjax.files.objects.record import Reference
+from ipjax.networks.dinov2 import DinoV2, Encoder
+from ipjax.records import Camera, Similarity
 from ipjax.synthetic.objects import make_object
+from ipjax.synthetic.photos import MadePhoto
+from ipjax.transforms import rotation_from_vector
 
 
 def test_a_comparison_tells_what_was_changed():
@@ -31,3 +47,63 @@ def test_a_file_in_the_way_is_told(tmp_path, capfd):
     (tmp_path / "out").write_text("")
     assert run(["demo", "-o", str(tmp_path / "out")]) == 2
     assert "a file of this name is in the way" in capfd.readouterr().err
+
+
+def test_the_photo_s_true_pose_says_where_the_object_is():
+    """A guessed shape of any frame and scale, found exactly where the photo's camera saw it, is the object exactly."""
+    turned = lambda *vector: rotation_from_vector(np.array(vector))
+    scene = Similarity(turned(0.3, -0.2, 0.5), np.array([0.05, 0.02, 0.7]), np.asarray(0.15))
+    there = Similarity(turned(-0.4, 0.6, 0.1), np.array([0.03, -0.02, 0.5]), np.asarray(0.15))
+    photo = MadePhoto(
+        np.zeros((4, 4, 3), np.uint8),
+        np.zeros((4, 4), bool),
+        Camera(focal=jnp.full(2, 600.0), centre=jnp.full(2, 1.5)),
+        there.to_jax(),
+        30.0,
+    )
+    guessed = Similarity(turned(0.1, 0.2, -0.3), np.array([0.01, 0.02, 1.0]), np.asarray(0.4))
+    seen_by = dict(rotation=guessed.rotation, translation=guessed.translation, scale=float(guessed.scale))
+    lens = dict(focal=(600.0, 600.0), centre=(1.5, 1.5), size=(4, 4), camera_given=True)
+    info = dataclasses.replace(
+        make_onboarded()[1],
+        reference=Reference(file="", sha256="", metric=False, method="inflate", seen=0.5, **seen_by, **lens),
+    )
+    # The scene's camera from the photo's, whose unit is the distance from it to the object.
+    unit = Similarity(np.eye(3), np.zeros(3), np.asarray(0.5))
+    camera_from_reference = scene @ there.inverse() @ unit
+    estimate = camera_from_reference @ guessed @ info.object_from_mesh.to_numpy().inverse()
+    found = place_through_photo(estimate.to_jax(), info, photo)
+    for name in ("rotation", "translation", "scale"):
+        np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=2e-6)
+
+
+def test_it_tells_of_the_mesh_and_of_the_photo(tmp_path, capfd, monkeypatch):
+    """With an encoder and settings that are quick, not good: files, numbers, and commands that would repeat it."""
+    encoder = Encoder(DinoV2(tiny("plain", 1), rngs=nnx.Rngs(0)), 0, "dinov2 tiny block=0 norm=1 float32 sha256:none")
+    small = OnboardConfig(directions=4, rolls=1, resolution=56, surface=256)
+    config = dataclasses.replace(TINY, resect=ResectConfig(views=2, pairs=64, count=64, drawn=2, polished=1, rounds=1))
+    monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: encoder)
+    monkeypatch.setattr("ipjax.inference.compilation_cache.use_compilation_cache", lambda: None)
+    for name in ("onboard", "onboard_photo"):
+        quick = functools.partial(getattr(demo_scene, name), config=small, progress=False)
+        monkeypatch.setattr(demo_scene, name, quick)
+    monkeypatch.setattr(demo_scene, "run_demo", functools.partial(demo_scene.run_demo, config=config))
+    status = run(["demo", "-o", str(tmp_path), "--seed", "1", "--json"])
+    out, text = capfd.readouterr()
+    told = json.loads(out)
+    assert status == (0 if told["found"] else 1) and told["folder"] == str(tmp_path)
+    shared = {"rotation_deg", "translation_mm", "true_diameter_mm", "diameter_mm", "add_diameters", "adds_diameters"}
+    assert shared < told.keys() and shared < told["photo"].keys()
+    assert told["photo"]["true_diameter_mm"] == told["true_diameter_mm"]
+    assert 25 <= told["photo"]["angle_deg"] <= 35 and told["photo"]["mask_iou"] > 0.9
+    assert "by the mesh: off by" in text and "by the photo: off by" in text
+    for name in ("photo.png", "photo_camera.json", "overlay.png", "photo_overlay.png", "bottle_photo.ipjax"):
+        assert (tmp_path / name).is_file(), name
+    commands = re.findall(r"^  ipjax (onboard|estimate) (.*)$", text, re.MULTILINE)
+    assert [command for command, _ in commands] == ["onboard", "estimate"] * 2
+    from ipjax.cli import build_parser
+
+    for command, words in commands:
+        given = build_parser().parse_args([command, *words.split()])
+        inputs = [given.source, given.camera] if command == "onboard" else [*given.objects, given.rgb, given.depth]
+        assert all(Path(path).is_file() for path in inputs if path is not None)
