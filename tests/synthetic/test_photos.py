@@ -1,5 +1,6 @@
 """Photos of one object alone: the true pose and the true angle are true, and the product finds the object by itself."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ from ipjax.synthetic.objects import make_object
 from ipjax.synthetic.photos import make_photo
 from ipjax.transforms import rotation_from_vector
 
-CAMERA = Camera(focal=np.array([600.0, 590.0], np.float32), centre=np.array([322.0, 238.0], np.float32))
+CAMERA = Camera(focal=jnp.asarray([600.0, 590.0]), centre=jnp.asarray([322.0, 238.0]))
 SEEN = Similarity(rotation_from_vector(np.array([0.4, -0.7, 0.2])), np.array([0.12, -0.05, 0.6]), np.asarray(0.15))
 
 
@@ -54,5 +55,5 @@ def test_seeds_decide(mesh, photo):
 
 
 def test_angles_out_of_order_are_refused(mesh):
-    with pytest.raises(ValueError, match="the smaller first, got 40 and 30"):
-        make_photo(mesh, SEEN.to_jax(), CAMERA, angles=(40, 30))
+    with pytest.raises(ValueError, match="the smaller first, got 40.0 and 30.0"):
+        make_photo(mesh, SEEN.to_jax(), CAMERA, angles=(40.0, 30.0))
