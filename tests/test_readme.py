@@ -61,9 +61,11 @@ def test_quickstart_runs(tmp_path, monkeypatch):
     found, picture = names["found"], names["picture"]
     assert bool(found.success)
     placed = place_through_photo(found.camera_from_object, names["info"], photo)
-    told = compare(placed, true, mug)
-    assert told.rotation < 15
-    assert told.translation < 0.25 * told.true_size and abs(told.size / told.true_size - 1) < 0.25
+    # One photo with one seed comes out 1.5° off. The rest is as good as the guesses of depth and focal length are.
+    assert compare(placed, true, mug).rotation < 5
+    assert abs(float(found.camera_from_object.scale) / float(true.scale) - 1) < 0.2
+    offset = np.asarray(found.camera_from_object.translation) - np.asarray(true.translation)
+    assert np.linalg.norm(offset) < 0.25 * float(true.scale)
     assert (tmp_path / "mug.ipjax").is_file()
     assert picture.dtype == np.uint8 and picture.shape[2] == 3
     assert jax.tree.all(jax.tree.map(lambda x: bool(np.isfinite(x).all()), found.camera_from_object))

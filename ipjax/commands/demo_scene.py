@@ -195,7 +195,8 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
 
 def place_through_photo(camera_from_object: Similarity, info: ObjectInfo, photo: MadePhoto) -> Similarity:
     """``camera_from_object`` of the photographed mesh, by the photo's true pose: an estimate tells where the photo's
-    camera was, in units of the distance from it to the middle of the guessed shape, which stands for the true one.
+    camera was, in units of the distance from it to the middle of the guessed shape, which stands for the true one. The
+    size is that only where the photo's camera was given: with a longer lens than the true one it would seem larger.
     """
     there = photo.camera_from_object.to_numpy()
     distance = there.translation[2]

@@ -17,7 +17,7 @@ from flax import nnx
 
 from ipjax.commands import demo_scene
 from ipjax.commands.demo_scene import compare, place_through_photo
-from ipjax.config import OnboardConfig, ResectConfig
+from ipjax.config import OnboardConfig, ResectConfig, ScoreConfig
 from ipjax.files.objects.record import Reference
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.records import Camera, Similarity
@@ -81,7 +81,11 @@ def test_it_tells_of_the_mesh_and_of_the_photo(tmp_path, capfd, monkeypatch):
     """With an encoder and settings that are quick, not good: files, numbers, and commands that would repeat it."""
     encoder = Encoder(DinoV2(tiny("plain", 1), rngs=nnx.Rngs(0)), 0, "dinov2 tiny block=0 norm=1 float32 sha256:none")
     small = OnboardConfig(directions=4, rolls=1, resolution=56, surface=256)
-    config = dataclasses.replace(TINY, resect=ResectConfig(views=2, pairs=64, count=64, drawn=2, polished=1, rounds=1))
+    config = dataclasses.replace(
+        TINY,
+        score=ScoreConfig(resolution=28, alternates=0, drawn=0),
+        resect=ResectConfig(views=2, pairs=64, count=64, drawn=2, polished=1, rounds=1),
+    )
     monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: encoder)
     monkeypatch.setattr("ipjax.inference.compilation_cache.use_compilation_cache", lambda: None)
     for name in ("onboard", "onboard_photo"):
