@@ -55,5 +55,5 @@ def test_seeds_decide(mesh, photo):
 
 
 def test_angles_out_of_order_are_refused(mesh):
-    with pytest.raises(ValueError, match="the smaller first, got 40.0 and 30.0"):
+    with pytest.raises(ValueError, match="180 degrees, the smaller first"):
         make_photo(mesh, SEEN.to_jax(), CAMERA, angles=(40.0, 30.0))
