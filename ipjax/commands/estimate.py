@@ -28,7 +28,16 @@ Depth of whole numbers needs a unit: --depth-scale 0.001 for millimetres, unless
 The pose in the JSON maps the coordinates of your mesh file to camera metres; every frame and unit is named there.
 For an object made from a photo it also has the pose relative to that photo. Where that photo had depth, the size it
 measured is kept; --size says another, --free-size lets it be found.
+
+  ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png \\
+      --compare compare.png --mesh-out mug.ply
+
+An object made from a photo without depth is found through that photo. --compare shows the image as the photo's camera
+would have seen it, beside the photo: where the pose is right, the two fit together. Its --mesh-out has, in place of the
+front that was guessed, the one that was measured.
 """
+
+MESHES = (".ply", ".glb", ".obj", ".stl")
 
 
 def add(commands: Any) -> None:
@@ -66,6 +75,20 @@ def add(commands: Any) -> None:
     options.add_seed(parser)
     options.add_output(parser, "JSON", "where the poses go (default: a line for each object on the screen)")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="a picture of the result (with --frames: a folder)")
+    parser.add_argument(
+        "--compare",
+        type=Path,
+        metavar="PNG",
+        help="of objects made from a photo without depth: the photo, and the image drawn into its view (with --frames: "
+        "a folder)",
+    )
+    parser.add_argument(
+        "--mesh-out",
+        type=Path,
+        metavar="MESH",
+        help="the mesh at its pose: .ply, .glb, .obj or .stl, metres, in the camera's axes (with --frames or several "
+        "objects: a folder, of .ply)",
+    )
     options.add_weights(parser)
     options.add_reporting(parser, quiet="no notes on stderr")
 
@@ -82,6 +105,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     many = arguments.frames is not None
     first = _read_first(frames[0], arguments) if not many else None
     objects = [load(path) for path in arguments.objects]
+    _check_objects(objects, arguments)
     if many:
         choose_masks(frames, [info.name for _, info in objects], arguments)
     identities = [info.encoder for _, info in objects]
@@ -135,10 +159,17 @@ def _check(arguments: argparse.Namespace) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is given once for each object, in their order")
     if arguments.output is not None:
         options.check_output(arguments.output, (".json",))
-    if arguments.overlay is not None and arguments.frames is None:
-        options.check_output(arguments.overlay, options.PICTURES)
-    elif arguments.overlay is not None and arguments.overlay.exists() and not arguments.overlay.is_dir():
-        raise ValueError(f"{arguments.overlay}: with --frames, the overlay is a folder")
+    several = arguments.frames is not None or len(arguments.objects) > 1
+    for name, path, suffixes, is_folder in (
+        ("overlay", arguments.overlay, options.PICTURES, arguments.frames is not None),
+        ("comparison", arguments.compare, options.PICTURES, arguments.frames is not None),
+        ("mesh output", arguments.mesh_out, MESHES, several),
+    ):
+        if path is not None and not is_folder:
+            options.check_output(path, suffixes)
+        elif path is not None and path.exists() and not path.is_dir():
+            of = "--frames" if arguments.frames is not None else "several objects"
+            raise ValueError(f"{path}: with {of}, the {name} is a folder")
     if arguments.size is not None:
         if not 1 <= arguments.size < 1e5:
             raise ValueError(f"--size is in millimetres; {arguments.size:g} cannot be right")
@@ -146,6 +177,17 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.diameter is not None and not 1e-4 < arguments.diameter < 100:
         raise ValueError(f"--diameter is in metres; {arguments.diameter:g} cannot be right")
     options.check_seed(arguments.seed)
+
+
+def _check_objects(objects: list[tuple[Any, Any]], arguments: argparse.Namespace) -> None:
+    """Refuse what these object files cannot give, before weights are loaded and anything is compiled."""
+    for path, (templates, info) in zip(arguments.objects, objects, strict=True):
+        if arguments.compare is not None and templates.reference is None:
+            raise ValueError(
+                f"--compare: {path} keeps no photo without depth that it was made from, so nothing to compare with"
+            )
+        if arguments.mesh_out is not None and (info.vertices is None or info.faces is None):
+            raise ValueError(f"--mesh-out: {path} keeps no mesh")
 
 
 def _read_first(files: FrameFiles, arguments: argparse.Namespace) -> Images:
@@ -208,6 +250,11 @@ def _estimate_frame(
         start = time.perf_counter()
         entry["overlay"] = str(_draw(files.name, images, results, estimator.config, arguments))
         entry["draw_seconds"] = round(time.perf_counter() - start, 6)
+    if arguments.compare is not None:
+        entry["comparison"] = str(_compare(files.name, results, arguments))
+    if arguments.mesh_out is not None:
+        for one, result, path in zip(entries, results, _mesh_paths(files.name, arguments), strict=True):
+            one["mesh_written"] = _write_mesh(result, path, messages)
     return entry
 
 
@@ -221,12 +268,56 @@ def _draw(name: str, images: Images, results: list[Any], config: Any, arguments:
     rgb = rgb if rgb.dtype == np.uint8 else (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
     evidence = [gather_evidence(r.templates, r.query, r.crop_estimate, r.info, config) for r in results]
     picture = draw(rgb, images.camera, [r.estimate for r in results], [r.info for r in results], evidence)
-    target = arguments.overlay
-    if arguments.frames is not None:
-        target.mkdir(parents=True, exist_ok=True)
-        target = target / f"{name}.png"
+    target = _picture_path(arguments.overlay, name, arguments)
     write_image(target, picture)
     return target
+
+
+def _picture_path(target: Path, name: str, arguments: argparse.Namespace) -> Path:
+    """The file of a frame's picture: the one named, or one in the folder, which is made."""
+    if arguments.frames is None:
+        return target
+    target.mkdir(parents=True, exist_ok=True)
+    return target / f"{name}.png"
+
+
+def _compare(name: str, results: list[Any], arguments: argparse.Namespace) -> Path:
+    """Write the photos of one frame's objects with the frame drawn into their views, a row each; returns the path."""
+    import numpy as np
+
+    from ipjax.inference.drawing import write_image
+    from ipjax.inference.photos.comparison import compare_with_photo
+
+    rows = []
+    for one in results:
+        title = f"{one.info.name}   confidence {float(one.estimate.confidence):.2f}"
+        if bool(one.estimate.success) and not bool(one.estimate.present):
+            title += "   not here, or not seen well enough: a guess"
+        rows.append(compare_with_photo(one.templates, one.query, one.crop_estimate, title))
+    target = _picture_path(arguments.compare, name, arguments)
+    write_image(target, np.concatenate(rows))
+    return target
+
+
+def _mesh_paths(name: str, arguments: argparse.Namespace) -> list[Path]:
+    """The mesh file of each object in a frame; named as masks are, where there are several."""
+    target = arguments.mesh_out
+    if arguments.frames is None and len(arguments.objects) == 1:
+        return [target]
+    return [target / f"{name}_{index:06d}.ply" for index in range(len(arguments.objects))]
+
+
+def _write_mesh(result: Any, path: Path, messages: Messages) -> str | None:
+    """Write the mesh of one object at its pose; returns its path, None where no pose was found."""
+    from ipjax.files.meshes.saving import save_mesh
+    from ipjax.inference.photos.corrected_mesh import pose_mesh
+
+    if not bool(result.estimate.success):
+        messages.note(f"{path}: not written, no pose of {result.info.name} was found")
+        return None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_mesh(pose_mesh(result), path)
+    return str(path)
 
 
 def _summary(frame: str, one: dict[str, Any]) -> str:

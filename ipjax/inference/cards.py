@@ -25,6 +25,7 @@ class Evidence:
         template: the template whose pairs led to the answer; None = no picture was kept.
         crop_points, template_points: the pairs, in pixels of the crop, and of the template if it had a single one.
         inlier: which of the pairs agree with the pose.
+        panels: of an object found through a photo: that photo, the query drawn into its view, and both.
     """
 
     crop: np.ndarray
@@ -32,6 +33,7 @@ class Evidence:
     crop_points: Float[np.ndarray, "k 2"]
     template_points: Float[np.ndarray, "k 2"]
     inlier: Bool[np.ndarray, " k"]
+    panels: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
 
 _PAPER, _CARD, INK, _FAINT = (18, 20, 26), (30, 33, 42), (238, 240, 245), (150, 156, 170)
@@ -56,6 +58,15 @@ def draw_card(estimate: PoseEstimate, info: ObjectInfo, evidence: Evidence | Non
         chosen = f"template {int(estimate.view)}"
         pen.text((margin + side + gap, y), chosen, _FAINT, find_font(13))
         y += 26
+        if evidence.panels is not None:
+            part = (2 * side + gap - 2 * margin) // 3
+            for i, (panel, text) in enumerate(
+                zip(evidence.panels, ("photo", "query in its view", "both"), strict=True)
+            ):
+                left = margin + i * (part + margin)
+                canvas.paste(Image.fromarray(_as_picture(panel, part)), (left, y))
+                pen.text((left, y + part + 6), text, _FAINT, find_font(13))
+            y += part + 32
     if not bool(estimate.success):
         pen.text((margin, y), "no pose: too few pairs, or degenerate ones", (248, 113, 113), find_font(16))
         return np.asarray(canvas)[: y + 40]

@@ -18,6 +18,7 @@ from ipjax.files.cameras.reading import as_intrinsics
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import writing
 from ipjax.inference.cards import INK, Evidence, attach_cards, draw_card, find_font, to_fixed_point
+from ipjax.inference.photos.comparison import photo_panels
 from ipjax.records import PoseEstimate, Query, Similarity, Templates
 
 PALETTE = ((64, 224, 208), (255, 183, 77), (186, 104, 200), (129, 199, 132), (100, 181, 246), (240, 98, 146))
@@ -57,6 +58,7 @@ def gather_evidence(
         crop_points=resize_pixels(crop_grid[q], (columns, rows), (width, height)),
         template_points=resize_pixels(template_grid[t], cells, (1, 1)),
         inlier=residual <= float(config.align.threshold) * float(estimate.camera_from_object.scale),
+        panels=None if templates.reference is None else photo_panels(templates, query, estimate, 2 * width),
     )
 
 
