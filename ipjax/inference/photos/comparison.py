@@ -11,7 +11,7 @@ from ipjax.inference.photos.drawing import draw_query_into_photo
 from ipjax.records import PoseEstimate, Query, Templates
 
 OUTLINE = (64, 224, 208)  # of the photo, over what was drawn
-_PAPER, _FAINT, _NOTHING = (18, 20, 26), (150, 156, 170), (44, 48, 58)
+_PAPER, _NOTHING = (18, 20, 26), (44, 48, 58)
 _SQUARES = 8  # of the checker, along a side
 CAPTIONS = ("photo", "query, drawn from the photo's camera", "both, square by square")
 
@@ -43,7 +43,7 @@ def compare_with_photo(
     for index, (panel, text) in enumerate(zip(panels, CAPTIONS, strict=True)):
         left = gap + index * (side + gap)
         page.paste(Image.fromarray(panel), (left, gap + top))
-        pen.text((left, gap + top + side + 8), text, INK if index else _FAINT, find_font(16))
+        pen.text((left, gap + top + side + 8), text, INK, find_font(16))
     return np.asarray(page)
 
 
@@ -60,7 +60,8 @@ def photo_panels(
         drawn, shown = drawing.rgb.astype(np.float32), drawing.shown
     else:
         drawn, shown = np.zeros_like(photo), np.zeros_like(mask)
-    window = _frame(mask | shown)
+    # Flying pixels make thin streaks, which shall not decide what is shown.
+    window = _frame(mask | ndimage.binary_opening(shown, iterations=2))
     # Colours go on beyond the border of what has any, so that enlarging does not darken it.
     photo, drawn = (_enlarge(_fill(*x), window, side) for x in ((photo, mask), (drawn, shown)))
     mask, shown = (_enlarge(x, window, side) > 0.5 for x in (mask, shown))
