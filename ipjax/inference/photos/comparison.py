@@ -68,7 +68,7 @@ def photo_panels(
     photo = np.where(mask[..., None], photo, 0)
     line = max(round(side / 200), 1)
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    outlined = lambda image: cv2.drawContours(np.ascontiguousarray(image), contours, -1, OUTLINE, line, cv2.LINE_AA)
+    outlined = lambda image: cv2.drawContours(np.array(image), contours, -1, OUTLINE, line, cv2.LINE_AA)
     field = np.arange(side) * _SQUARES // side
     other = (field[:, None] + field[None]) % 2 == 1
     alone = np.where(shown[..., None], drawn, np.array(_NOTHING) / 255)

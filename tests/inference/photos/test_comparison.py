@@ -58,7 +58,7 @@ def test_a_given_size_does_not_move_the_drawing(pairs, seed, larger):
     pair = pairs[seed]
     found, behind = estimate_at_the_truth(pair, larger)
     drawing = draw_query_into_photo(pair.templates, pair.query, found)
-    distance = pair.reference_from_query.translation[2]
+    distance = pair.photo_from_ellipsoid.translation[2]
     print(drawing.behind / distance, behind / distance)
     assert abs(drawing.behind - behind) < 0.03 * distance
     assert np.abs(shifts(pair, drawing).mean(axis=0)).max() < 0.3
