@@ -97,9 +97,9 @@ class ResectConfig(eqx.Module):
     width: float = 0.03  # of the robust loss, likewise
     scale_gate: tuple[float, float] = (0.45, 2.2)  # around the size that the areas of both outlines tell
     steps: int = _static(10)  # of Gauss and Newton
-    drawn: int = _static(16, least=1)  # hypotheses of all views that are drawn
-    polished: int = _static(4, least=1)  # best of them that are refined on what their drawings match
-    rounds: int = _static(2)  # of it
+    drawn: int = _static(12, least=1)  # hypotheses of all views that are drawn
+    polished: int = _static(5, least=1)  # best of them that are refined on what their drawings match
+    rounds: int = _static(3)  # of it
     window: float = 3.0  # patches in which it is
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn
