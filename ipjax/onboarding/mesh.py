@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from ipjax.config import DescribeConfig, OnboardConfig
-from ipjax.estimation.features import centre, check_cut, cut, describe, identity_of, principal_basis
+from ipjax.estimation.features import centre, centre_on, check_cut, cut, describe, identity_of, principal_basis
 from ipjax.files.meshes.cleaning import clean
 from ipjax.files.meshes.loading import load_mesh
 from ipjax.files.meshes.mesh import Mesh, normalise
@@ -24,7 +24,7 @@ from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.files.weights.hashes import hash_file
-from ipjax.onboarding.photo_views import PhotoSource, ReferencePhoto, photo_poses, put_photo
+from ipjax.onboarding.photo_views import ROLLS, PhotoSource, ReferencePhoto, photo_poses, put_photo
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.progress import bar
 from ipjax.records import UNNAMED, Appearance, Camera, Patches, ReferenceView, Similarity, Surface, Templates, View
@@ -161,7 +161,13 @@ def make_templates(
         except BaseException:  # Ctrl-C too: views that have not begun are not needed
             pool.shutdown(wait=False, cancel_futures=True)
             raise
-    patches, mean, norm = jax.jit(centre)(jax.tree.map(lambda *x: jnp.stack(x), *patches))
+    raw = jax.tree.map(lambda *x: jnp.stack(x), *patches)
+    patches, mean, norm = jax.jit(centre)(raw)
+    if photo is not None:
+        # The mean of the photo itself: the drawings from beside show its colours, not all of what an encoder sees.
+        mean = jax.jit(centre)(jax.tree.map(lambda x: x[:ROLLS], raw))[1]
+        features, norm = centre_on(raw.features.astype(mean.dtype), mean)
+        patches = dataclasses.replace(patches, features=features.astype(raw.features.dtype))
     basis = None
     if config.channels:
         basis = jnp.asarray(principal_basis(patches, config.channels))
