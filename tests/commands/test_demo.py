@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.command_lines import run
+from builders.estimates import make_estimate
 from builders.objects import make_object as make_onboarded
 from builders.tiny_dinov2 import tiny
-from builders.tiny_pipeline import TINY
 from flax import nnx
 
 from ipjax.commands import demo_scene
 from ipjax.commands.demo_scene import compare, place_through_photo
-from ipjax.config import OnboardConfig, ResectConfig, ScoreConfig
+from ipjax.config import OnboardConfig
 from ipjax.files.objects.record import Reference
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.records import Camera, Similarity
@@ -77,21 +77,22 @@ def test_the_photo_s_true_pose_says_where_the_object_is():
         np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=2e-6)
 
 
+def guess(encoder, templates, query, key, config, diameter):
+    """An estimate that compiles in no time: upright, 100 mm, as far as what the query measured."""
+    depth = jnp.sum(jnp.where(query.view.mask, query.view.depth, 0)) / jnp.sum(query.view.mask, dtype=jnp.float32)
+    return make_estimate(Similarity(jnp.eye(3), jnp.stack([0 * depth, 0 * depth, depth]), jnp.asarray(0.1)))
+
+
 def test_it_tells_of_the_mesh_and_of_the_photo(tmp_path, capfd, monkeypatch):
-    """With an encoder and settings that are quick, not good: files, numbers, and commands that would repeat it."""
+    """All but the estimate: scene, photo, both objects, files, numbers, and commands that would repeat it."""
     encoder = Encoder(DinoV2(tiny("plain", 1), rngs=nnx.Rngs(0)), 0, "dinov2 tiny block=0 norm=1 float32 sha256:none")
     small = OnboardConfig(directions=4, rolls=1, resolution=56, surface=256)
-    config = dataclasses.replace(
-        TINY,
-        score=ScoreConfig(resolution=28, alternates=0, drawn=0),
-        resect=ResectConfig(views=2, pairs=64, count=64, drawn=2, polished=1, rounds=1),
-    )
     monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: encoder)
     monkeypatch.setattr("ipjax.inference.compilation_cache.use_compilation_cache", lambda: None)
     for name in ("onboard", "onboard_photo"):
         quick = functools.partial(getattr(demo_scene, name), config=small, progress=False)
         monkeypatch.setattr(demo_scene, name, quick)
-    monkeypatch.setattr(demo_scene, "run_demo", functools.partial(demo_scene.run_demo, config=config))
+    monkeypatch.setattr("ipjax.inference.estimator.estimate", guess)
     status = run(["demo", "-o", str(tmp_path), "--seed", "1", "--json"])
     out, text = capfd.readouterr()
     told = json.loads(out)
@@ -100,6 +101,8 @@ def test_it_tells_of_the_mesh_and_of_the_photo(tmp_path, capfd, monkeypatch):
     assert shared < told.keys() and shared < told["photo"].keys()
     assert told["photo"]["true_diameter_mm"] == told["true_diameter_mm"]
     assert 25 <= told["photo"]["angle_deg"] <= 35 and told["photo"]["mask_iou"] > 0.9
+    assert told["photo"]["guessed_diameter_mm"] == pytest.approx(100)
+    assert told["photo"]["guessed_diameter_std_mm"] == pytest.approx(2)
     assert "by the mesh: off by" in text and "by the photo: off by" in text
     for name in ("photo.png", "photo_camera.json", "overlay.png", "photo_overlay.png", "bottle_photo.ipjax"):
         assert (tmp_path / name).is_file(), name
