@@ -271,6 +271,8 @@ def _print_outcome(
             f"confidence {confidence:.2f}; {'found' if comparison.good else 'NOT found'}"
         )
     if photo is not None:
+        if not photo.present:
+            print("    the estimate itself calls this pose a guess (present is False)")
         print(
             f"    the shape is guessed: it measures {photo.guessed_size * 1000:.1f} mm, give or take "
             f"{photo.size_std * 1000:.0f} (scale_std); its mask covers the true one by {photo.mask:.0%} (IoU)"
