@@ -105,6 +105,7 @@ class ResectConfig(eqx.Module):
     cover: float = 0.3  # least share of a patch that must be drawn
     guess: float = 0.1  # standard deviation of the guessed distance from the front to the centre, in diameters
     independent: float = 7.0  # number of independent pairs; fitted by ``python -m benchmarks.calibration``
+    noise: float = 0.1  # standard deviation of a match that fits perfectly, patches
 
 
 class ConfidenceConfig(eqx.Module):
@@ -131,10 +132,11 @@ class Config(eqx.Module):
 
     @staticmethod
     def fast() -> "Config":
-        """Fewer hypotheses, none of them turned, three drawn, no ``settle``: confuses front and back more often."""
+        """Fewer hypotheses, none of them turned, few drawn, no ``settle``: confuses front and back more often."""
         return Config(
             match=MatchConfig(views=6),
             refine=RefineConfig(steps=8, settle=False),
+            resect=ResectConfig(drawn=6, polished=2, rounds=1),
             score=ScoreConfig(alternates=0, drawn=3),
         )
 

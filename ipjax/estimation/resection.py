@@ -117,7 +117,8 @@ def resect(
 
     def of_view(key, points, rays, normals, weight):
         table = draw_minimal_sets(key, weight, config.count, 3)
-        total = jnp.maximum(jnp.sum(weight), 1e-9)
+        total = jnp.sum(weight)
+        total = jnp.where(total > 1e-9, total, 1)
         middle = jnp.sum(weight[:, None] * points, axis=0) / total
         centred = points - middle
         chosen = lambda x: jnp.moveaxis(x[table], 0, -1)  # corner, coordinate, set
@@ -250,7 +251,7 @@ def draw_query(
     best = jnp.max(alike, axis=1)
     found = jnp.isfinite(best)
     pull = jnp.where(jnp.isfinite(alike), jnp.exp((alike - jnp.where(found, best, 0)[:, None]) / config.softness), 0)
-    pull = pull / jnp.maximum(jnp.sum(pull, axis=1, keepdims=True), 1e-9)
+    pull = pull / jnp.maximum(jnp.sum(pull, axis=1, keepdims=True), 1)  # the best counts 1
     rays = jnp.matmul(pull, rays_of(reference, reference.patches.points), precision="highest")
     weight = jnp.where(found & (cover > config.cover), jnp.maximum(best, 0), 0)
     drawn_colour = mean(jnp.where(shown[..., None], image[..., :3], 0)) / jnp.maximum(cover, 1e-6)[:, None]

@@ -29,7 +29,7 @@ from ipjax.estimation.resection import (
     splat_query,
 )
 from ipjax.estimation.scene import SceneGrid
-from ipjax.estimation.scoring import depth_agreement
+from ipjax.estimation.scoring import closeness, depth_agreement
 from ipjax.records import Agreement, Hypotheses, PoseEstimate, Query, ReferenceView, Similarity, Templates
 
 
@@ -100,7 +100,10 @@ def estimate_through_photo(
     near = (weight > 0) & (squared < (resection.threshold * sight.diagonal) ** 2) & success
     count = jnp.sum(near, dtype=jnp.int32)
     beside = jnp.sum(jnp.where(near, squared * placed[:, 2] ** 2, 0)) / jnp.maximum(count, 1).astype(squared.dtype)
-    spread, scale_std = _spread(reference, camera, fit, pose, config, scale_known=diameter is not None)
+    total = jnp.sum(weight)
+    middle = jnp.sum(weight[:, None] * placed, axis=0) / jnp.where(total > 1e-12, total, 1)
+    arm = jnp.matmul(camera[0], pose.translation, precision="highest") + camera[1] - middle
+    spread, scale_std = _spread(reference, camera[0], fit, arm, width, pose, config, scale_known=diameter is not None)
     with jax.named_scope("confidence"):
         agreement = Agreement(
             depth=depth_agreement(templates.surface, scene.depth, scene.mask, scene.cloud.camera, pose, config.score),
@@ -112,7 +115,8 @@ def estimate_through_photo(
         )
         weights = jnp.stack([jnp.asarray(x, score.dtype) for x in config.confidence.photo])
         confidence = jnp.where(success, probability(agreement, weights), 0)
-    nearest = jnp.argmax(jnp.sum(templates.camera_from_object.rotation * pose.rotation, axis=(-2, -1)))
+    # A view without a patch, such as padding, is none.
+    apart = jnp.where(jnp.any(templates.patches.valid, axis=1), closeness(templates, pose), jnp.inf)
     return PoseEstimate(
         camera_from_object=pose,
         confidence=confidence,
@@ -122,7 +126,7 @@ def estimate_through_photo(
         ambiguity=rotation_ambiguity(poses, score, spread[:3, :3], config.confidence),
         agreement=agreement,
         hypotheses=Hypotheses(poses, jnp.clip(score, 0, 1)),
-        view=nearest.astype(jnp.int32),
+        view=jnp.argmin(apart).astype(jnp.int32),
         view_score=matches.ranking,
         inliers=count,
         rmse=root(beside),
@@ -132,8 +136,10 @@ def estimate_through_photo(
 
 def _spread(
     reference: ReferenceView,
-    camera: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+    turn: Float[Array, "3 3"],
     fit: Resection,
+    arm: Float[Array, "3"],
+    width: Float[Array, ""],
     pose: Similarity,
     config: Config,
     *,
@@ -142,20 +148,36 @@ def _spread(
     """The covariance of rotation (rad) and translation (metres) in the query's axes, and the scale's deviation.
 
     Across the photo's ray the rays tell; along it, and with it in size, the guess is only as good as guesses are.
+
+    Args:
+      turn: the photo's camera from the query's.
+      arm: from the centre of the points that were fitted to the object's, metres, in the photo's camera.
+      width: of the robust loss, rays.
     """
     scale, dtype = pose.scale, fit.information.dtype
     unit = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, scale, dtype)])
+    # Neighbouring patches err alike, which no residual shows: even a perfect fit is only as exact as matches are.
+    side = round(reference.patches.valid.shape[0] ** 0.5)
+    patch = reference.view.mask.shape[1] / side / reference.view.camera.focal[0]
+    loss = fit.loss + (config.resect.noise * patch / width) ** 2
     # In diameters, and bounded where nothing is determined: a radian, half a diameter.
-    known = fit.information * unit[:, None] * unit[None] * config.resect.independent / jnp.maximum(fit.loss, 1e-3)
+    known = fit.information * unit[:, None] * unit[None] * config.resect.independent / jnp.maximum(loss, 1e-9)
     found = invert_positive(known + jnp.diag(jnp.array([1, 1, 1, 4, 4, 4], dtype)))
     along = found[5, 5]
     # The distance of the photo's camera moves no measured surface, and so not the object on it.
-    guessed = config.resect.guess**2
-    found = found.at[5, :].set(0).at[:, 5].set(0).at[5, 5].set(guessed)
-    back = camera[0].T
-    turn = jnp.zeros((6, 6), dtype).at[:3, :3].set(back).at[3:, 3:].set(back) * unit[:, None]
-    spread = jnp.matmul(jnp.matmul(turn, found, precision="highest"), turn.T, precision="highest")
+    found = found.at[5, :].set(0).at[:, 5].set(0)
+    # A turn about the points' centre moves the object's by the turn × the arm; both fields' signs turn, as the query's
+    # camera is found from the photo's.
+    x, y, z = arm / scale
+    zero = jnp.zeros_like(x)
+    lever = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
+    to_object = jnp.eye(6, dtype=dtype).at[3:, :3].set(lever)
+    of_guess = jnp.zeros((6, 6), dtype).at[5, 5].set(config.resect.guess**2)
+    moved = jnp.matmul(jnp.matmul(to_object, found, precision="highest"), to_object.T, precision="highest") + of_guess
+    back = jnp.zeros((6, 6), dtype).at[:3, :3].set(turn.T).at[3:, 3:].set(turn.T) * unit[:, None]
+    spread = jnp.matmul(jnp.matmul(back, moved, precision="highest"), back.T, precision="highest")
+    spread = (spread + spread.T) / 2
     if scale_known:
         return spread, jnp.zeros_like(scale)
     distance = reference.camera_from_object.translation[2]
-    return spread, scale * root(guessed + along) / distance
+    return spread, scale * root(config.resect.guess**2 + along) / distance

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ipjax_kernels.positive import root, solve_positive
+
 
 class Weak(NamedTuple):
     """Weak-perspective poses: ``ray = scale · (rotation @ point)[:2] + offset``; the batch axes last."""
@@ -47,11 +49,11 @@ def weak_perspective(points: Float[Array, "3 3 n"], rays: Float[Array, "3 2 n"])
     # (k aa − pp) (k bb − qq) = (k ab − pq)² for k = scale²; the larger root leaves both depths real.
     safe = jnp.where(determined, area, 1)
     half = (aa * qq + bb * pp - 2 * ab * pq) / (2 * safe)
-    squared = half + jnp.sqrt(jnp.maximum(half**2 - image_area / safe, 0))
+    squared = half + root(half**2 - image_area / safe)
     squared = jnp.where(determined, squared, 1)
-    depth_first = jnp.sqrt(jnp.maximum(squared * aa - pp, 0))
-    depth_second = jnp.sqrt(jnp.maximum(squared * bb - qq, 0)) * jnp.where(squared * ab - pq < 0, -1, 1)
-    scale = jnp.sqrt(squared)
+    depth_first = root(squared * aa - pp)
+    depth_second = root(squared * bb - qq) * jnp.where(squared * ab - pq < 0, -1, 1)
+    scale = root(squared)
     rotations, offsets = [], []
     for side in (1, -1):
         moved_first = jnp.concatenate([image_first, side * depth_first[None]])
@@ -66,7 +68,8 @@ def weak_perspective(points: Float[Array, "3 3 n"], rays: Float[Array, "3 2 n"])
 def _frame(first, second):
     """Three orthonormal axes (axis, coordinate, set) of two vectors; of two on a line, some."""
     across = jnp.cross(first, second, axis=0)
-    unit = lambda x: x / jnp.maximum(jnp.sqrt(jnp.sum(x * x, axis=0)), 1e-12)
+    length = lambda x: root(jnp.sum(x * x, axis=0))
+    unit = lambda x: x / jnp.where(length(x) > 1e-12, length(x), 1)
     ahead, up = unit(first), unit(across)
     return jnp.stack([ahead, up, jnp.cross(ahead, up, axis=0)])
 
@@ -105,7 +108,8 @@ def refine_resection(
       weight: of each pair; 0 = absent.
       width: rays' unit.
     """
-    share = weight / jnp.maximum(jnp.sum(weight), 1e-12)
+    total = jnp.sum(weight)
+    share = weight / jnp.where(total > 1e-12, total, 1)
     middle = jnp.sum(share[:, None] * points, axis=0)
     # Turned about their centre, so that turn and shift are as independent as they can be.
     points = points - middle
@@ -139,10 +143,13 @@ def refine_resection(
     def step(state, _):
         rotation, translation, (loss, hessian, slope), damping = state
         diagonal = jnp.diagonal(hessian)
-        damped = hessian + jnp.diag(damping * diagonal + 1e-9 * jnp.max(diagonal) + 1e-20)
-        move = -jnp.linalg.solve(damped, slope)
-        length = jnp.sqrt(jnp.sum(move[:3] ** 2))
-        move = move * jnp.minimum(1, 0.5 / jnp.maximum(length, 1e-12))
+        largest = jnp.max(diagonal)
+        # Where nothing tells the pose it stays, and its derivative, in which the inverse is squared, is finite.
+        floor = jnp.where(largest > 1e-12, 1e-9 * largest, 1)
+        damped = hessian + jnp.diag(damping * diagonal + floor)
+        move = -solve_positive(damped, slope)
+        length = root(jnp.sum(move[:3] ** 2))
+        move = move * jnp.minimum(1, 0.5 / jnp.maximum(length, 1e-6))
         new_rotation = jnp.matmul(_exponential(move[:3]), rotation, precision="highest")
         new_translation = translation + move[3:]
         new = evaluate(new_rotation, new_translation)
@@ -161,7 +168,7 @@ def _exponential(turn):
     """The rotation by |turn| about it (Rodrigues), exact at zero, too."""
     squared = jnp.sum(turn**2)
     small = squared < 1e-8
-    angle = jnp.sqrt(jnp.where(small, 1, squared))
+    angle = root(jnp.where(small, 1, squared))
     sine = jnp.where(small, 1 - squared / 6, jnp.sin(angle) / angle)
     versine = jnp.where(small, 0.5 - squared / 24, (1 - jnp.cos(angle)) / jnp.where(small, 1, squared))
     x, y, z = turn

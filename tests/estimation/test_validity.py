@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.objects import make_object, with_reference
+from builders.photo_objects import CONFIG, encoder, known
 from builders.tiny_pipeline import DRAWN, make_sized_query, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -294,6 +295,84 @@ def test_a_reference_view_is_absent_where_it_is_no_number(name, bad):
     for key, leaf in wanted.items():
         np.testing.assert_array_equal(told[key], leaf)
     assert finite(dataclasses.replace(templates, reference=None))[0].reference is None
+
+
+# Of an estimate through the photo: as above, but where the photo showed nothing no template is matched, and the surface
+# only tells how well the depth agrees.
+THROUGH_PHOTO = {name: meaning for name, meaning in MEANING.items() if ".appearance" not in name}
+THROUGH_PHOTO |= {"templates.seen": OF_PATCH}
+THROUGH_PHOTO |= {f"templates.reference{name}": meaning for name, meaning in OF_REFERENCE.items()}
+
+
+@functools.cache
+def photo_problem() -> dict:
+    templates, query = known()
+    return {"templates": templates, "query": query, "diameter": jnp.asarray(0.2, jnp.float32)}
+
+
+def solve_through_photo(leaves: dict[str, np.ndarray], used=encoder) -> ipjax.PoseEstimate:
+    names, structure = list(flatten(photo_problem())), jax.tree.structure(photo_problem())
+    whole = jax.tree.unflatten(structure, [jnp.asarray(leaves[name]) for name in names])
+    return estimate(used, whole["templates"], whole["query"], KEY, CONFIG, whole["diameter"])
+
+
+def mark_absent_in_photo(leaves: dict[str, np.ndarray], name: str, places: np.ndarray) -> None:
+    """As `mark_absent`, of the reference view, too."""
+    rows = tuple(places.T)
+    if name == "templates.seen":
+        leaves["templates.patches.valid"][rows] = False
+    elif name.startswith("templates.reference"):
+        mark = f"templates.reference{THROUGH_PHOTO[name]}"
+        leaves[name][rows] = 0
+        leaves[mark][rows[: leaves[mark].ndim]] = 0
+    else:
+        mark_absent(leaves, name, places)
+
+
+def test_every_leaf_of_an_object_from_a_photo_has_a_meaning():
+    leaves = flatten(photo_problem())
+    assert {name for name, leaf in leaves.items() if leaf.dtype.kind == "f"} == THROUGH_PHOTO.keys()
+    found = solve_through_photo(leaves)
+    assert bool(found.success) and float(found.confidence) > 0.5
+
+
+@pytest.mark.parametrize("used", [encoder, None], ids=["drawn", "undrawn"])
+@given(bad=st.sampled_from(BAD), count=st.integers(1, 40), seed=st.integers(0, 99))
+@settings(max_examples=3)
+def test_through_a_photo_what_is_not_finite_is_absent_or_the_answer_says_so(used, bad, count, seed):
+    """Poison random places of each leaf in turn, then all of it."""
+    rng = np.random.default_rng(seed)
+    for name, meaning in THROUGH_PHOTO.items():
+        poisoned, marked = ({key: leaf.copy() for key, leaf in flatten(photo_problem()).items()} for _ in range(2))
+        leaf = poisoned[name]
+        places = rng.choice(leaf.size, min(count, max(leaf.size // 8, 1)), replace=False)
+        leaf.reshape(-1)[places] = bad
+        found = solve_through_photo(poisoned, used)
+        assert_finite(found)
+        if meaning == "nothing":
+            assert_says_so(found)
+            continue
+        mark_absent_in_photo(marked, name, np.stack(np.unravel_index(places, leaf.shape), axis=-1))
+        wanted = solve_through_photo(marked, used)
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6, err_msg=name), found, wanted)
+
+
+@pytest.mark.parametrize("used", [encoder, None], ids=["drawn", "undrawn"])
+@pytest.mark.parametrize("bad", BAD)
+def test_through_a_photo_an_answer_from_nothing_but_poison_says_so(used, bad):
+    """A whole leaf. Without the photo's patches a pose may be found by the pairs, but nobody would trust it."""
+    for name in THROUGH_PHOTO:
+        leaves = flatten(photo_problem())
+        found = solve_through_photo(leaves | {name: np.full_like(leaves[name], bad)}, used)
+        assert_finite(found)
+        if name in HARMLESS_THROUGH_PHOTO:
+            continue
+        assert not bool(found.present), name
+        if ".reference.patches" not in name and ".reference.view.depth" not in name:
+            assert_says_so(found)
+
+
+HARMLESS_THROUGH_PHOTO = {"templates.extents"}
 
 
 def scene() -> dict:
