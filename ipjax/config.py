@@ -105,7 +105,7 @@ class ResectConfig(eqx.Module):
     cover: float = 0.3  # least share of a patch that must be drawn
     guess: float = 0.1  # standard deviation of the guessed distance from the front to the centre, in diameters
     independent: float = 7.0  # number of independent pairs; fitted by ``python -m benchmarks.calibration``
-    noise: float = 0.1  # standard deviation of a match that fits perfectly, patches
+    noise: float = 0.15  # standard deviation of a match that fits perfectly, patches
 
 
 class ConfidenceConfig(eqx.Module):

@@ -132,6 +132,9 @@ def resect(
         rotation, offset, scale = take(weak.rotation), take(weak.offset), weak.scale[best]
         distance = 1 / jnp.maximum(scale, 1e-9)
         translation = jnp.concatenate([offset * distance[:, None], distance[:, None]], axis=1)
+        # What is absent is some pose that can be drawn and differentiated.
+        rotation = jnp.where(present[:, None, None], rotation, jnp.eye(3, dtype=rotation.dtype))
+        translation = jnp.where(present[:, None], translation, jnp.stack([0 * expected, 0 * expected, 1 / expected]))
         translation = translation - jnp.sum(rotation * middle, axis=-1)
         fit = lambda turn, shift: refine_resection(turn, shift, points, rays, weight, width, steps=config.steps)
         found = jax.vmap(fit)(rotation, translation)
@@ -244,8 +247,8 @@ def draw_query(
     shared = jnp.where(reference.patches.valid, jnp.minimum(cover, outline), 0)
     overlap = jnp.sum(cosine * shared) / jnp.maximum(jnp.sum(shared), 1e-6)
     # Nearby, every patch of the photo is compared, and the place is the mean of those that are most alike.
-    grid = reference.patches.grid
-    apart = jnp.max(jnp.abs(grid[:, None] - grid[None]), axis=-1)
+    grid = np.indices((rows, columns)).reshape(2, -1)
+    apart = jnp.asarray(np.abs(grid[:, :, None] - grid[:, None]).max(axis=0), depth.dtype)
     alike = jnp.matmul(features, photo.T, precision="highest")
     alike = jnp.where((apart <= config.window) & reference.patches.valid[None], alike, -jnp.inf)
     best = jnp.max(alike, axis=1)

@@ -65,9 +65,9 @@ def estimate_through_photo(
         if encoder is None:
             look = jax.vmap(lambda turn, shift: splat_query(reference, query, turn, shift, sight)[1])
             camera, depth = (found.rotation, found.translation), look(found.rotation, found.translation)
-            every = lambda x: jnp.broadcast_to(
-                x.reshape(-1, *x.shape[2:]), (found.support.shape[0], *x.reshape(-1, *x.shape[2:]).shape)
-            )
+            # Each candidate is judged by the pairs of all views.
+            pool = lambda x: x.reshape(-1, *x.shape[2:])
+            every = lambda x: jnp.broadcast_to(pool(x), (found.support.shape[0], *pool(x).shape))
             points, where, weight = every(pairs.camera), every(rays), every(pairs.weight)
             overlap = colour = shared = jnp.ones_like(found.support)
             score = found.support
@@ -166,8 +166,8 @@ def _spread(
     along = found[5, 5]
     # The distance of the photo's camera moves no measured surface, and so not the object on it.
     found = found.at[5, :].set(0).at[:, 5].set(0)
-    # A turn about the points' centre moves the object's by the turn × the arm; both fields' signs turn, as the query's
-    # camera is found from the photo's.
+    # A turn about the points' centre moves the object's, too, by turn × arm. (That the pose is the inverse of what was
+    # fitted changes both signs, and so no product.)
     x, y, z = arm / scale
     zero = jnp.zeros_like(x)
     lever = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
