@@ -10,7 +10,7 @@ import pytest
 from builders.objects import make_object, with_reference
 from builders.photo_objects import CONFIG, encoder, known
 from builders.tiny_pipeline import DRAWN, make_sized_query, two_objects
-from hypothesis import Phase, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors import safe_open
 from safetensors.numpy import save_file
@@ -337,16 +337,14 @@ def test_every_leaf_of_an_object_from_a_photo_has_a_meaning():
 
 
 @pytest.mark.parametrize("used", [encoder, None], ids=["drawn", "undrawn"])
-@given(bad=st.sampled_from(BAD), count=st.integers(1, 40), seed=st.integers(0, 99))
-@settings(max_examples=3, phases=[Phase.generate])
-def test_through_a_photo_what_is_not_finite_is_absent_or_the_answer_says_so(used, bad, count, seed):
-    """Poison random places of each leaf in turn, then all of it."""
-    rng = np.random.default_rng(seed)
+def test_through_a_photo_what_is_not_finite_is_absent_or_the_answer_says_so(used):
+    """Poison random places of each leaf in turn."""
+    rng = np.random.default_rng(0)
     for name, meaning in THROUGH_PHOTO.items():
         poisoned, marked = ({key: leaf.copy() for key, leaf in flatten(photo_problem()).items()} for _ in range(2))
         leaf = poisoned[name]
-        places = rng.choice(leaf.size, min(count, max(leaf.size // 8, 1)), replace=False)
-        leaf.reshape(-1)[places] = bad
+        places = rng.choice(leaf.size, min(rng.integers(1, 41), max(leaf.size // 8, 1)), replace=False)
+        leaf.reshape(-1)[places] = rng.choice(BAD, len(places))
         found = solve_through_photo(poisoned, used)
         assert_finite(found)
         if meaning == "nothing":
