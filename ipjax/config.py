@@ -104,7 +104,7 @@ class ResectConfig(eqx.Module):
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn
     guess: float = 0.1  # standard deviation of the guessed distance from the front to the centre, in diameters
-    independent: float = 7.0  # number of independent pairs; fitted by ``python -m benchmarks.calibration``
+    independent: float = 20.0  # number of independent pairs; not fitted to real images
     noise: float = 0.15  # standard deviation of a match that fits perfectly, patches
 
 

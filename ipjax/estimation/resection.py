@@ -322,12 +322,11 @@ def compare_drawings(
 
 
 def metres_per_unit(
-    reference: ReferenceView, depth: Float[Array, "h w"], fallback: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The size of a model unit, and the distance (model units) of the guessed front that it was found on.
+    reference: ReferenceView, depth: Float[Array, "h w"]
+) -> tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+    """The size of a model unit, the distance (model units) of the guessed front that it was found on, and whether any.
 
-    Medians of the ratio of the measured depth in the photo's camera to the guessed one, where both are; ``fallback``
-    where they nowhere are.
+    Medians of the ratio of the measured depth in the photo's camera to the guessed one, where both are.
     """
     guess = reference.view.depth
     both = (depth > 0) & (guess > 0)
@@ -335,7 +334,7 @@ def metres_per_unit(
     median = lambda x: jnp.sort(jnp.where(both, x, jnp.inf).reshape(-1))[last]
     unit, front = median(depth / jnp.where(both, guess, 1)), median(guess)
     found = jnp.any(both)
-    return jnp.where(found, unit, fallback), jnp.where(found, front, reference.camera_from_object.translation[2])
+    return jnp.where(found, unit, 1), jnp.where(found, front, 1), found
 
 
 def query_from_object(

@@ -69,17 +69,16 @@ def estimate_through_photo(
             pool = lambda x: x.reshape(-1, *x.shape[2:])
             every = lambda x: jnp.broadcast_to(pool(x), (found.support.shape[0], *pool(x).shape))
             points, where, weight = every(pairs.camera), every(rays), every(pairs.weight)
-            overlap = colour = shared = jnp.ones_like(found.support)
-            score = found.support
+            overlap = shared = jnp.ones_like(found.support)
+            colour, score = jnp.zeros_like(found.support), found.support
         else:
             compared = compare_drawings(encoder, templates, query, found, sight, resection)
             camera, drawn = (compared.rotation, compared.translation), compared.drawing
             points, where, weight = drawn.points, drawn.rays, drawn.weight
             depth, overlap, colour, shared = drawn.depth, drawn.overlap, drawn.colour, drawn.shared
             score = overlap
-        typical = sight.query_extent / sight.extent  # the distance of the photo's camera, metres
-        fallback = typical / reference.camera_from_object.translation[2]
-        units, front = jax.vmap(lambda one: metres_per_unit(reference, one, fallback))(depth)
+        units, front, sized = jax.vmap(lambda one: metres_per_unit(reference, one))(depth)
+        score = jnp.where(sized, score, -1)
         behind = jnp.zeros_like(units)
         if diameter is not None:
             # The front is where it was measured; of the given size, the rest is nearer or farther.

@@ -241,7 +241,7 @@ def degenerate():
         "templates alike": (lambda t: t.patches.features, alike, False),
         "nothing seen": (lambda t: t.seen, jnp.zeros_like, False),
         "no outline of the photo": (lambda t: t.reference.view.mask, jnp.zeros_like, False),
-        "no guessed depth": (lambda t: t.reference.view.depth, jnp.zeros_like, True),
+        "no guessed depth": (lambda t: t.reference.view.depth, jnp.zeros_like, False),
         "no patch of the photo": (lambda t: t.reference.patches.valid, jnp.zeros_like, True),
         "one patch of the photo": (lambda t: t.reference.patches.valid, only, True),
     }
