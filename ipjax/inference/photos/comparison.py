@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw
 from scipy import ndimage
 
 from ipjax.inference.cards import INK, find_font
-from ipjax.inference.photos.drawing import draw_query_into_photo
+from ipjax.inference.photos.drawing import draw_query_into_photo, fill_from_nearest
 from ipjax.records import PoseEstimate, Query, Templates
 
 OUTLINE = (64, 224, 208)  # of the photo, over what was drawn
@@ -63,7 +63,7 @@ def photo_panels(
     # Flying pixels make thin streaks, which shall not decide what is shown.
     window = _frame(mask | ndimage.binary_opening(shown, iterations=2))
     # Colours go on beyond the border of what has any, so that enlarging does not darken it.
-    photo, drawn = (_enlarge(_fill(*x), window, side) for x in ((photo, mask), (drawn, shown)))
+    photo, drawn = (_enlarge(fill_from_nearest(*x), window, side) for x in ((photo, mask), (drawn, shown)))
     mask, shown = (_enlarge(x, window, side) > 0.5 for x in (mask, shown))
     photo = np.where(mask[..., None], photo, 0)
     line = max(round(side / 200), 1)
@@ -90,14 +90,6 @@ def _frame(mask: Bool[np.ndarray, "h w"], margin: float = 0.06) -> tuple[float, 
     side = float((high - low).max()) * (1 + 2 * margin)
     left, top = (low + high - side) / 2
     return float(left), float(top), side
-
-
-def _fill(image: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The image with the colour of the nearest known pixel at all others."""
-    if not known.any():
-        return image
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return image[tuple(nearest)]
 
 
 def _enlarge(image: np.ndarray, window: tuple[float, float, float], side: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.sparse.linalg import splu
 from ipjax.cameras import project, unproject
 from ipjax.files.meshes.mesh import Mesh, make_mesh
 from ipjax.inference.estimator import Result
-from ipjax.inference.photos.drawing import draw_query_into_photo
+from ipjax.inference.photos.drawing import draw_query_into_photo, fill_from_nearest
 from ipjax.records import PoseEstimate, Query, Templates
 
 FARTHEST = 0.35  # diameters between guess and measurement, beyond which it was something else that was measured
@@ -83,20 +83,12 @@ def correct_front(
 
 def _sample(image: Float[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """A depth image between its pixels; where it has none, that of the nearest pixel which has."""
-    return ndimage.map_coordinates(_fill(image, image > 0), pixels[:, ::-1].T, order=1, mode="nearest")
-
-
-def _fill(image: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """The image with the value of the nearest known pixel at all others."""
-    if not known.any():
-        return image
-    nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return image[tuple(nearest)]
+    return ndimage.map_coordinates(fill_from_nearest(image, image > 0), pixels[:, ::-1].T, order=1, mode="nearest")
 
 
 def _is_smooth(image: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], most: float) -> Bool[np.ndarray, "h w"]:
     """Where an image is within ``most`` of the median of its neighbourhood: not at flying pixels."""
-    return np.abs(image - ndimage.median_filter(_fill(image, known), 5)) < most
+    return np.abs(image - ndimage.median_filter(fill_from_nearest(image, known), 5)) < most
 
 
 def _spread(
@@ -109,7 +101,7 @@ def _spread(
     """
     height, width = mask.shape
     rim = 0.04 * np.sqrt(mask.sum())
-    inside = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    inside = np.asarray(ndimage.distance_transform_edt(np.pad(mask, 1)))[1:-1, 1:-1]
     weight = np.where(known, np.clip((inside - 1) / rim, 0, 1), 0)[mask]
     number = np.full((height + 2, width + 2), -1)
     number[1:-1, 1:-1][mask] = np.arange(mask.sum())
@@ -136,7 +128,7 @@ def _is_front(
     """Which vertices the photo shows: none of the surface is before them, in a square of three pixels."""
     height, width = guess.shape
     place = np.round(np.clip(pixels, -1, [width, height])).astype(int)
-    inside = (place >= 0).all(axis=1) & (place < [width, height]).all(axis=1)
+    inside = np.asarray(((place >= 0) & (place < [width, height])).all(axis=1))
     column, row = np.where(inside[:, None], place, 0).T
     behind = ndimage.maximum_filter(guess, 3)[row, column]
     return inside & (guess[row, column] > 0) & (seen[:, 2] <= behind + slack)

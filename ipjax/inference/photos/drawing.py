@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import ndimage
 
 from ipjax.estimation.resection import measure_sight, splat_query
 from ipjax.records import PoseEstimate, Query, ReferenceView, Similarity, Templates
@@ -97,3 +98,11 @@ def _find_distance(
     best = max(_RATIOS, key=alike)
     best = max(best + _FINER, key=alike)
     return float((np.exp(best) - 1) * distance)
+
+
+def fill_from_nearest(image: np.ndarray, known: Bool[np.ndarray, "h w"]) -> np.ndarray:
+    """The image with the value or colour of the nearest known pixel at all others."""
+    if not known.any():
+        return image
+    row, column = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+    return image[row, column]
