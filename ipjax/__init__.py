@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         MatchConfig,
         OnboardConfig,
         RefineConfig,
+        ResectConfig,
         ScoreConfig,
     )
     from ipjax.estimation.features import describe, observe
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from ipjax.inference.frames import frame, frame_turned
     from ipjax.onboarding.mesh import onboard
     from ipjax.onboarding.photo import onboard_photo
-    from ipjax.records import Camera, Patches, PoseEstimate, Query, Surface, Templates, View
+    from ipjax.records import Camera, Patches, PoseEstimate, Query, ReferenceView, Surface, Templates, View
     from ipjax.synthetic.degradation import degrade
     from ipjax.synthetic.objects import make_object
     from ipjax.synthetic.scenes import make_scene
@@ -63,7 +64,9 @@ __all__ = [
     "Patches",
     "PoseEstimate",
     "Query",
+    "ReferenceView",
     "RefineConfig",
+    "ResectConfig",
     "ScoreConfig",
     "Similarity",
     "Surface",
@@ -114,6 +117,7 @@ _HOMES = {
         "MatchConfig",
         "OnboardConfig",
         "RefineConfig",
+        "ResectConfig",
         "ScoreConfig",
     ),
     "estimation.features": (
@@ -149,6 +153,7 @@ _HOMES = {
         "Patches",
         "PoseEstimate",
         "Query",
+        "ReferenceView",
         "Surface",
         "Templates",
         "View",

@@ -23,7 +23,8 @@ CONVENTIONS = {
     "matrix": "4 x 4, row by row, [scale * rotation, translation; 0 0 0 1]: x_camera = matrix @ (x, 1)",
     "rigid_matrix": "4 x 4, row by row, [rotation, translation; 0 0 0 1]: x_camera = rigid_matrix @ (scale * x, 1)",
     "present": "false: the object is not here, or not seen well enough, and the pose is a guess; by confidence",
-    "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter; "
+    "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter, "
+    "or, for an object from a photo without depth, turned by less than 15 degrees; "
     "of method paper: the share of pairs that agree",
     "covariance": "6 x 6, of rotation vector (rad, about the object's centre) and translation (m), camera axes",
     "ambiguity": "the object's axis about which it may be turned, and by how much (standard deviation)",
