@@ -81,7 +81,7 @@ def estimate_at_the_truth(pair: PhotoPair, larger: float | None = None) -> tuple
     camera = pair.reference_from_query
     turn, shift = (jnp.asarray(x, jnp.float32) for x in (camera.rotation, camera.translation))
     depth = splat_query(pair.reference, pair.query, turn, shift, measure_sight(pair.reference, pair.query))[1]
-    unit, front = metres_per_unit(pair.reference, depth, jnp.asarray(0.0))
+    unit, front, _ = metres_per_unit(pair.reference, depth)
     if larger is None:
         return make_estimate(query_from_object(pair.reference, turn, shift, unit)), 0.0
     behind = (1 - larger) * unit * front
