@@ -82,11 +82,11 @@ def test_every_field_takes_the_value_that_it_has():
     ("change", "says"),
     [
         ("match.view=4", "there is no setting 'match.view'; near it: match.views"),
-        ("views=4", "there is no setting 'views'; near it: match.views, score.views"),
+        ("views=4", "there is no setting 'views'; near it: match.views, resect.views, score.views"),
         ("view=4", "near it: match.views"),
         ("mach.views=4", "near it: match.views"),
         ("macth=4", "near it: match"),
-        ("colour=red", "there is no setting 'colour'; there are match, align, refine, score, confidence"),
+        ("colour=red", "there is no setting 'colour'; there are match, align, refine, resect, score, confidence"),
         ("match.colour=red", "there is no setting 'match.colour'; there are match.ranking, match.centred"),
         ("match=4", "match is a group of settings: name one of them, for instance match."),
         ("match.views.more=4", "match.views is one value, not a group"),
