@@ -44,7 +44,9 @@ def search(
     shape = _ROWS, _COLUMNS
     # Only a device has layouts, and the simulation of JAX 0.10 does not know the word.
     iota = partial(plgpu.broadcasted_iota, layout=plgpu.Layout.WGMMA) if interpret is None else lax.broadcasted_iota
-    transforms = plgpu.TilingTransform((8, _DEPTH)), plgpu.SwizzleTransform(2 * _DEPTH)
+    # JAX 0.12 declares a method of their base class without defining it.
+    tiling = plgpu.TilingTransform((8, _DEPTH))  # pyright: ignore[reportAbstractUsage]
+    transforms = tiling, plgpu.SwizzleTransform(2 * _DEPTH)  # pyright: ignore[reportAbstractUsage]
 
     def nearest(query_ref, template_ref, forth_index, forth_similarity, back_index, back_similarity):
         view, part, step = (lax.axis_index(name) for name in ("view", "part", "step"))
