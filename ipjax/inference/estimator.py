@@ -22,7 +22,8 @@ MULTIPLE = 64
 
 # XLA's options on a CPU that compile in two thirds of the time what then takes a twentieth to a tenth longer; rounding
 # differs (benchmarks/results/compiling.md). LLVM's level 1 gains nothing more; at level 0 queries take twice as long.
-QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False}
+# JAX 0.12 has the older emitters no more, and refuses the option.
+QUICK: dict[str, str | bool] = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -47,6 +47,7 @@ def test_recovers_pose_and_size(templates, seed):
     assert_near(found.camera_from_object, truth, 0.12, 0.15, 20)
 
 
+@pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="this JAX has one kind of emitters, the tests' and users'")
 def test_the_default_compilation_has_the_same_answer(templates):
     """Tests compile with XLA's older emitters on a CPU (see conftest.py), users with its default ones."""
     default = jax.jit(
