@@ -86,7 +86,7 @@ class ScoreConfig(eqx.Module):
 
 
 class ResectConfig(eqx.Module):
-    """From a photo without depth to its camera among the query's points (``estimation.resection``)."""
+    """From a photo without depth to its camera among the query's points (``estimation.photo.resection``)."""
 
     views: int = _static(12, least=1)  # of the object whose pairs are kept
     pairs: int = _static(256, least=3)  # most pairs of each

@@ -16,10 +16,10 @@ from ipjax.estimation.alignment import align
 from ipjax.estimation.confidence import covariance, find_rival, pair_information, probability, rotation_ambiguity
 from ipjax.estimation.features import identity_of, object_features
 from ipjax.estimation.matching import match, select
+from ipjax.estimation.photo.through_photo import estimate_through_photo
 from ipjax.estimation.refinement import information, refine, settle
 from ipjax.estimation.scene import SceneGrid
 from ipjax.estimation.scoring import score, score_drawn, seen_share
-from ipjax.estimation.through_photo import estimate_through_photo
 from ipjax.estimation.validity import finite_estimate, finite_query, finite_templates
 from ipjax.metrics.poses import turn_angle
 from ipjax.records import Agreement, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates

@@ -12,11 +12,11 @@ ORDER = [
     ["ipjax.cameras"],
     ["ipjax.metrics", "ipjax.networks"],
     # The graph. Its stages do not import one another.
-    ["ipjax.estimation", "ipjax.estimation.validity", "ipjax.estimation.contour"],
+    ["ipjax.estimation", "ipjax.estimation.photo", "ipjax.estimation.validity", "ipjax.estimation.contour"],
     ["ipjax.estimation.residuals"],
     [f"ipjax.estimation.{s}" for s in ("features", "matching", "alignment", "refinement", "scoring", "confidence")],
-    ["ipjax.estimation.scene", "ipjax.estimation.resection"],
-    ["ipjax.estimation.through_photo"],
+    ["ipjax.estimation.scene", "ipjax.estimation.photo.resection"],
+    ["ipjax.estimation.photo.through_photo"],
     ["ipjax.estimation.pipeline"],
     # What cannot be jitted.
     ["ipjax.progress"],
@@ -57,7 +57,7 @@ def package_of(name: str) -> str:
     """The name in `ORDER` that a module belongs to."""
     given = name
     # A stage that ORDER does not name has no place; a module of any other package has its package's.
-    while name not in LAYERS or (name in ("ipjax", "ipjax.estimation") and name != given):
+    while name not in LAYERS or (name in ("ipjax", "ipjax.estimation", "ipjax.estimation.photo") and name != given):
         name, _, _ = name.rpartition(".")
         assert name, f"{given} has no place in ORDER"
     return name

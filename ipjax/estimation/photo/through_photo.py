@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ipjax.config import Config
 from ipjax.estimation.confidence import find_rival, probability, rotation_ambiguity
 from ipjax.estimation.features import object_features
-from ipjax.estimation.resection import (
+from ipjax.estimation.photo.resection import (
     compare_drawings,
     match_photo,
     measure_sight,
