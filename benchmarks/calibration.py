@@ -3,7 +3,8 @@
 Reads what `benchmarks.photo_pairs synthetic` wrote: objects made in code on cluttered tables, known from their mesh,
 from degraded copies of it, from one RGB-D photo and from one photo, sought where they are and behind another object's
 mask. Half of the objects fit the numbers of `ConfidenceConfig`, the other half judge those that the code has now. No
-object of the real data is among them.
+object of the real data is among them. Those known from one photo without depth are fitted and judged apart, and printed
+only.
 
     python -m benchmarks.photo_pairs synthetic --queries 5 --pairs 100 --methods rgbd rgb scan level2 level3 \
         --output out/pairs.jsonl
@@ -149,6 +150,8 @@ def main() -> None:
         judge_photos(*split(photos))
     rows = [row for row in rows if not from_photo(row)]
     if not rows:
+        if options.page:
+            parser.error("the page judges objects that were not known from one photo alone, and no line is of any")
         return
     fit, held = split(rows)
     now = ConfidenceConfig()

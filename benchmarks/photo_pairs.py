@@ -16,7 +16,7 @@ each estimate says of its own certainty, are what `benchmarks.calibration` reads
 be known from degraded meshes (``--methods level2``, see `ipjax.synthetic.degradation`).
 
 Results are lines of JSON, one per pair and method, written as they come: run again to go on. Templates are fewer than
-by default (24 × 8 instead of 40 × 10) for speed.
+by default (24 × 8 instead of 40 × 10) for speed; objects from "rgb" have the photo's views, whatever is asked for.
 """
 
 import argparse

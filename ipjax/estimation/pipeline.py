@@ -67,7 +67,8 @@ def estimate(
         has_size = jnp.isfinite(diameter) & (diameter > 0)
         usable, diameter = usable & has_size, jnp.where(has_size, diameter, 1)
     if templates.reference is not None and config.score.ranking == "render":
-        return finite_estimate(estimate_through_photo(encoder, templates, query, usable, key, config, diameter))
+        used = encoder if config.score.drawn else None
+        return finite_estimate(estimate_through_photo(used, templates, query, usable, key, config, diameter))
     with jax.named_scope("match"):
         matches = match(*comparable(templates, query.patches, config), config.match)
         pairs = select(matches, query.patches, templates, config.match)
