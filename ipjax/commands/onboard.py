@@ -95,6 +95,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         for warning in warned:
             messages.say(f" {warning}", mark="warning:", style="yellow")
         unit = _diameter(info, is_photo)
+        if info.reference is not None:
+            messages.say(f"camera of the photo: {info.reference.describe_camera()}")
         messages.say(f"{arguments.output}: {count} templates of {info.name}, diameter {unit}, in {seconds:.0f} s")
         if arguments.report is not None:
             messages.say(f"{arguments.report}: what was made of it")
@@ -106,6 +108,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
             "templates": count,
             "diameter_mesh_units": None if is_photo and not info.metres_per_unit else size,
             "diameter_mm": 1e3 * size * info.metres_per_unit if info.metres_per_unit else None,
+            "photo_camera": None if info.reference is None else info.reference.camera_as_json(),
             "encoder": info.encoder,
             "notes": list(info.notes),
             "warnings": [*messages.warnings, *warned],

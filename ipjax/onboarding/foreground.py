@@ -1,7 +1,8 @@
 """The object in a photo: reading any photo, finding the mask, cutting it out as the reconstruction model was trained.
 
 A mask comes from, in this order: the caller; the photo's alpha channel; GrabCut from a box or a click; a background of
-one colour. Where none works, `find_foreground` refuses with one sentence, and leaves a picture of what it tried.
+one colour; an installed matting package whose model is here. Where none works, `find_foreground` refuses with one
+sentence, and leaves a picture of what it tried.
 """
 
 import dataclasses
@@ -13,9 +14,11 @@ from jaxtyping import Bool, Float, UInt8
 from PIL import Image, ImageOps
 
 from ipjax.cameras import mask_from_coverage, resize_pixels
+from ipjax.files.cameras.exif import ExifFocal, find_focal
 from ipjax.files.images.masks import as_mask
-from ipjax.files.images.opening import get_orientation, open_image, read_size
+from ipjax.files.images.opening import get_orientation, get_tags, open_image, read_size
 from ipjax.files.storage.writing import writing
+from ipjax.onboarding.matting import MattingError, find_matting, matte
 
 MAX_SIDE = 2048  # pixels; larger photos are reduced
 MIN_SIDE = 16  # pixels of the object's longer side
@@ -36,6 +39,7 @@ class Photo:
     notes: tuple[str, ...] = ()
     orientation: int = 1  # as EXIF said that the file's pixels are to be turned; done here
     full_size: tuple[int, int] | None = None  # width and height of the file's upright image; None = by the scale
+    focal: ExifFocal | None = None  # as EXIF tells it; None = no file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +49,7 @@ class Foreground:
     rgb: UInt8[np.ndarray, "h w 3"]
     mask: Bool[np.ndarray, "h w"]
     alpha: UInt8[np.ndarray, "h w"]  # soft edge where the photo had one, else 0 and 255
-    method: str  # given, alpha, grabcut or background
+    method: str  # given, alpha, grabcut, background or matting
     notes: tuple[str, ...] = ()
 
 
@@ -67,7 +71,7 @@ def read_photo(path: str | Path, *, max_side: int = MAX_SIDE) -> Photo:
         photo = _from_image(upright, full, max_side)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    return dataclasses.replace(photo, orientation=orientation)
+    return dataclasses.replace(photo, orientation=orientation, focal=find_focal(get_tags(image), full))
 
 
 def _from_image(image: Image.Image, full: tuple[int, int], max_side: int) -> Photo:
@@ -167,9 +171,16 @@ def _find(photo, mask, box, click, attempts) -> Foreground:
     found, spread = _plain_background(rgb)
     if spread > 10.0:
         attempts.append(("other than the border", found))
+        matting, without = find_matting()
+        if matting is not None:
+            try:
+                found = matte(rgb, matting)
+            except MattingError as error:
+                raise ForegroundError(str(error)) from None
+            return _accept(photo, found, "matting", attempts)
         raise ForegroundError(
             "no mask was given, the photo has no transparency, and its background is not plain: "
-            "give a mask, a box around the object, or a click on it"
+            f"give a mask, a box around the object, or a click on it{without}"
         )
     return _accept(photo, found, "background", attempts)
 
@@ -240,6 +251,7 @@ def _accept(photo: Photo, mask: np.ndarray, method: str, attempts: list) -> Fore
             "alpha": "the mask is the photo's transparency",
             "grabcut": "the mask was cut out by GrabCut from the box or click",
             "background": "the mask is what differs from the plain background",
+            "matting": "the mask was cut out by the package rembg, which takes what stands out",
         }[method]
     )
     soft = photo.alpha if photo.alpha is not None and method == "alpha" else np.uint8(255) * mask.astype(np.uint8)

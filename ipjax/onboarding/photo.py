@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from ipjax.cameras import resize, resize_pixels
+from ipjax.cameras import middle, resize, resize_pixels
 from ipjax.config import OnboardConfig
+from ipjax.files.cameras.exif import ExifFocal
 from ipjax.files.cameras.intrinsics import Intrinsics, list_misfits
 from ipjax.files.cameras.reading import as_intrinsics, read_camera
 from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import read_depth, remove_sentinel
 from ipjax.files.images.masks import read_mask
-from ipjax.files.objects.record import ObjectInfo, Reference
+from ipjax.files.objects.record import GUESS_DEVIATION, ObjectInfo, Reference
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.hashes import hash_file
 from ipjax.inference.cutting import undistort_frame
@@ -50,7 +51,9 @@ class PreparedPhoto:
 
     foreground: Foreground
     depth: np.ndarray | None  # along z, metres, 0 = unknown
-    camera: Camera | None
+    camera: Camera | None  # None = to be guessed
+    camera_source: str = "guessed"  # or "given", or "exif"
+    focal_deviation: float = GUESS_DEVIATION  # relative standard deviation
 
 
 def onboard_photo(
@@ -77,11 +80,13 @@ def onboard_photo(
     Args:
       source: a photo's file, or a `Photo`.
       encoder: default: the best weights on this machine.
-      mask: file, or height × width: the object. Default: transparency, ``box``, ``click``, or a plain background.
-      box: (x, y, width, height) around the object, pixels of the photo's file.
+      mask: file, or height × width: the object. Default: transparency, ``box``, ``click``, a plain background, or rembg
+        where that package and a model of it are installed.
+      box: (x, y, width, height) around the object, pixels of the photo's file as it is shown upright.
       click: (x, y) on the object, likewise.
       depth: file, or height × width along z, aligned to the photo; needs ``camera``. The object is then in metres.
-      camera: anything that `read_camera` or `as_intrinsics` of `ipjax.files.cameras.reading` takes.
+      camera: anything that `read_camera` or `as_intrinsics` of `ipjax.files.cameras.reading` takes. Default: a focal
+        length by the file's EXIF where it has one, else a guess.
       depth_scale: metres per unit of depth; default: the camera file's, else 1 for floats.
       lrm: "triposr" (needs its weights), "inflate" (needs none), or "auto": what was measured where there is depth,
         else TripoSR where its weights are, else inflation. Nothing is downloaded.
@@ -180,24 +185,32 @@ def prepare_photo(
     if depth is not None:
         assert intrinsics is not None
         metres = _to_metres(np.asarray(depth), foreground.mask, photo.scale, depth_scale, intrinsics)
-    if intrinsics is None:
-        return PreparedPhoto(foreground, None, None)
     whole = photo.full_size or (width / photo.scale, height / photo.scale)
+    found = {"camera_source": "given", "focal_deviation": 0.0}
+    if intrinsics is None:
+        told = photo.focal or ExifFocal()
+        if told.note:
+            foreground = dataclasses.replace(foreground, notes=(*foreground.notes, told.note))
+        if told.pixels is None:
+            return PreparedPhoto(foreground, None, None)
+        found = {"camera_source": "exif", "focal_deviation": told.deviation}
+        x, y = middle(*whole)
+        intrinsics = Intrinsics(np.array([[told.pixels, 0, x], [0, told.pixels, y], [0, 0, 1]]))
     intrinsics = dataclasses.replace(intrinsics, matrix=resize(intrinsics.matrix, whole, (width, height)))
     if intrinsics.distortion:
         nothing = np.zeros((height, width), np.float32)
-        rgb, metres_, found, _ = undistort_frame(
+        rgb, metres_, kept, _ = undistort_frame(
             foreground.rgb, nothing if metres is None else metres, foreground.mask, None, intrinsics
         )
         metres = None if depth is None else metres_
         foreground = dataclasses.replace(
             foreground,
             rgb=rgb,
-            mask=np.asarray(found),
-            alpha=np.uint8(255) * np.asarray(found, np.uint8),
+            mask=np.asarray(kept),
+            alpha=np.uint8(255) * np.asarray(kept, np.uint8),
             notes=(*foreground.notes, "the lens's distortion was undone"),
         )
-    return PreparedPhoto(foreground, metres, intrinsics.camera)
+    return PreparedPhoto(foreground, metres, intrinsics.camera, **found)
 
 
 def _to_metres(
@@ -246,6 +259,7 @@ def _describe(
         return None
     pose, lens = made.camera_from_mesh, made.camera
     image = prepared.foreground.rgb
+    kept = METHODS[method].keeps_camera  # else the network's own is as good as a guess
     height, width = image.shape[:2]
     zoom = min(1.0, _PICTURE / max(height, width))
     small = cv2.resize(image, (max(1, round(width * zoom)), max(1, round(height * zoom))), interpolation=cv2.INTER_AREA)
@@ -260,7 +274,8 @@ def _describe(
         focal=(float(focal[0]), float(focal[1])),
         centre=(float(centre[0]), float(centre[1])),
         size=(int(width), int(height)),
-        camera_given=prepared.camera is not None and METHODS[method].keeps_camera,
+        camera_source=prepared.camera_source if kept else "guessed",
+        focal_deviation=prepared.focal_deviation if kept else GUESS_DEVIATION,
         metric=made.metric,
         method=method,
         seen=float(np.asarray(templates.surface.seen).mean()),

@@ -63,7 +63,7 @@ def test_the_photo_s_true_pose_says_where_the_object_is():
     )
     guessed = Similarity(turned(0.1, 0.2, -0.3), np.array([0.01, 0.02, 1.0]), np.asarray(0.4))
     seen_by = dict(rotation=guessed.rotation, translation=guessed.translation, scale=float(guessed.scale))
-    lens = dict(focal=(600.0, 600.0), centre=(1.5, 1.5), size=(4, 4), camera_given=True)
+    lens = dict(focal=(600.0, 600.0), centre=(1.5, 1.5), size=(4, 4), camera_source="given")
     info = dataclasses.replace(
         make_onboarded()[1],
         reference=Reference(file="", sha256="", metric=False, method="inflate", seen=0.5, **seen_by, **lens),

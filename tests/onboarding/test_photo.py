@@ -5,9 +5,11 @@ import io
 import json
 import re
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders import exif as exif_tags
 from builders.objects import make_object
 from builders.tiny_dinov2 import tiny
 from flax import nnx
@@ -17,12 +19,12 @@ from ipjax import cli
 from ipjax.config import OnboardConfig
 from ipjax.files.cameras.intrinsics import Intrinsics
 from ipjax.files.objects.loading import check, load
-from ipjax.files.objects.record import Reference
+from ipjax.files.objects.record import GUESS_DEVIATION, Reference
 from ipjax.files.objects.saving import save
 from ipjax.inference.reports import CONVENTIONS, relative_pose, relative_pose_as_json
 from ipjax.networks.dinov2 import DinoV2, Encoder
 from ipjax.onboarding import photo as photos
-from ipjax.onboarding.foreground import Photo
+from ipjax.onboarding.foreground import Photo, read_photo
 from ipjax.onboarding.reconstruction.reconstruct import reconstruct_with_weights
 from ipjax.onboarding.report import findings
 from ipjax.onboarding.report.page import write_report
@@ -295,3 +297,109 @@ def test_too_many_channels_are_refused_before_anything_is_drawn(encoder, monkeyp
     assert cli.main([str(w) for w in words]) == 2
     assert re.search(r"features of \d+ channels cannot be cut to 5000", capsys.readouterr().err)
     assert not (tmp_path / "ball.ipjax").exists()
+
+
+# --- a photo from anywhere --------------------------------------------------------------------------------------------
+
+
+STORED = {  # how a camera that was turned stores what is shown upright
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: image.swapaxes(0, 1),
+    6: lambda image: image.swapaxes(0, 1)[::-1],
+    7: lambda image: image.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda image: image.swapaxes(0, 1)[:, ::-1],
+}
+ON_FILM = 54  # mm
+
+
+def save_photo(path, orientation=1, size=None, tags=()):
+    """The ball before a plain wall as a camera stores it: no mask, and the sizes before it was turned upright."""
+    rgb, mask, _ = ball()
+    rgb[~mask] = 200
+    image = Image.fromarray(np.ascontiguousarray(STORED[orientation](rgb)))
+    image = image if size is None else image.resize(size)
+    written = {exif_tags.FOCAL_ON_FILM: ON_FILM, exif_tags.WIDTH: image.width, exif_tags.HEIGHT: image.height}
+    image.save(path, exif=exif_tags.make_exif(written | dict(tags), orientation))
+    return path
+
+
+@pytest.fixture(scope="module")
+def upright(encoder, tmp_path_factory):
+    path = save_photo(tmp_path_factory.mktemp("upright") / "photo.png")
+    return photos.onboard_photo(path, encoder, CONFIG, progress=False)
+
+
+@pytest.mark.parametrize("orientation", range(2, 9))
+def test_a_turned_photo_is_the_upright_one(orientation, tmp_path):
+    true = photos.prepare_photo(save_photo(tmp_path / "upright.png"))
+    found = photos.prepare_photo(save_photo(tmp_path / "turned.png", orientation))
+    same = lambda name: np.testing.assert_array_equal(getattr(found.foreground, name), getattr(true.foreground, name))
+    same("rgb"), same("mask")
+    jax.tree.map(np.testing.assert_array_equal, found.camera, true.camera)
+    assert (found.camera_source, found.foreground.notes) == ("exif", true.foreground.notes)
+
+
+def test_a_turned_photo_makes_the_object_of_the_upright_one(encoder, upright, tmp_path):
+    turned = photos.onboard_photo(save_photo(tmp_path / "photo.png", 6), encoder, CONFIG, progress=False)
+    true, found = upright.info.reference, turned.info.reference
+    assert true.camera_source == found.camera_source == "exif" and 0 < found.focal_deviation < 0.2
+    assert found.focal == true.focal == pytest.approx((ON_FILM * np.hypot(160, 120) / np.hypot(36, 24),) * 2)
+    assert (found.centre, found.size) == (true.centre, true.size) == ((79.5, 59.5), (160, 120))
+    np.testing.assert_array_equal(found.translation, true.translation)
+    same = lambda a, b: np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    jax.tree.map(same, turned.templates, upright.templates)
+
+
+def test_the_object_keeps_where_its_focal_length_is_from(encoder, upright, tmp_path):
+    path = tmp_path / "ball.ipjax"
+    save(path, upright.templates, upright.info)
+    kept = load(path)[1]
+    assert kept.reference == dataclasses.replace(
+        upright.info.reference, rotation=kept.reference.rotation, translation=kept.reference.translation
+    )
+    assert "EXIF" in kept.reference.describe_camera() and any("54 mm on 35 mm film" in note for note in kept.notes)
+    # Files of before said only whether the camera was given.
+    told = upright.info.reference.as_json()
+    for name in ("camera_source", "focal_deviation"):
+        del told[name]
+    before = Reference.from_json(told | {"camera_given": False})
+    assert before.camera_source == "guessed" and before.focal_deviation == GUESS_DEVIATION
+
+
+@pytest.mark.parametrize(
+    ("tags", "size", "given", "source", "focal", "words"),
+    [
+        ({}, (80, 60), {}, "exif", ON_FILM * 100 / np.hypot(36, 24), "54 mm"),
+        (
+            {exif_tags.WIDTH: 320, exif_tags.HEIGHT: 240},
+            None,
+            {},
+            "exif",
+            ON_FILM * 200 / np.hypot(36, 24),
+            "320 × 240",
+        ),
+        ({exif_tags.WIDTH: 320}, None, {}, "guessed", None, "is a part"),  # 320 × 120: cropped since
+        ({exif_tags.FOCAL_ON_FILM: 0}, None, {}, "guessed", None, "were guessed"),
+        ({}, None, {"camera": K}, "given", FOCAL, "mask is what differs"),
+    ],
+)
+def test_the_focal_length_is_given_or_of_exif_or_guessed(tags, size, given, source, focal, words, tmp_path):
+    path = save_photo(tmp_path / "photo.jpg", size=size, tags=tags)
+    prepared = photos.prepare_photo(path, **given)
+    made, _ = reconstruct_with_weights(prepared.foreground, method="inflate", camera=prepared.camera)
+    assert prepared.camera_source == source and any(words in note for note in made.report)
+    assert (prepared.camera is None) == (source == "guessed") and (prepared.focal_deviation == 0) == (source == "given")
+    if focal is not None:
+        np.testing.assert_allclose(made.camera.focal, focal, rtol=1e-6)
+    assert not (source == "given" and any("EXIF" in note for note in made.report))
+
+
+def test_exif_keeps_to_a_photo_that_is_reduced(tmp_path):
+    photo = read_photo(save_photo(tmp_path / "photo.jpg", 6), max_side=80)
+    prepared = photos.prepare_photo(photo)
+    assert prepared.foreground.mask.shape == (60, 80)
+    np.testing.assert_allclose(prepared.camera.focal, ON_FILM * 100 / np.hypot(36, 24), rtol=1e-6)
+    np.testing.assert_allclose(prepared.camera.centre, (39.5, 29.5))

@@ -7,6 +7,7 @@ Every reader raises one sentence of `ValueError` that names the file, and none t
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
@@ -17,6 +18,8 @@ BYTES_PER_PIXEL = 12  # of memory while an image is decoded, converted and copie
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM")  # Pillow knows more, some of which run programs
 ORIENTATION = 0x0112  # EXIF
 _ORIENTATION_KEPT = "ipjax orientation"  # among what Pillow knows of an image
+_TAGS_KEPT = "ipjax exif"
+_EXIF = 0x8769  # where the photo's own tags stand
 
 
 def read_rgb(path: str | Path) -> np.ndarray:
@@ -69,9 +72,9 @@ def open_image(path: str | Path, *, load: bool = True, max_side: int | None = No
                 image.draft(None, (max_side, max_side))
             needed += BYTES_PER_PIXEL * image.size[0] * image.size[1]
             check_budget(needed, f"an image of {width} × {height} pixels")
-            turn = get_orientation(image)
+            turn, tags = get_orientation(image), _read_tags(image)
             image.load()  # Pillow turns a TIFF by its orientation here, and drops the orientation
-            image.info[_ORIENTATION_KEPT] = turn
+            image.info |= {_ORIENTATION_KEPT: turn, _TAGS_KEPT: tags}
     except UnidentifiedImageError:
         raise ValueError(f"{path}: not an image") from None
     except Image.DecompressionBombError:
@@ -94,6 +97,19 @@ def get_orientation(image: Image.Image) -> int:
     except Exception:  # a broken block of EXIF raises many kinds
         return 1
     return turn if isinstance(turn, int) and 1 <= turn <= 8 else 1
+
+
+def get_tags(image: Image.Image) -> dict[int, Any]:
+    """EXIF of an image that `open_image` decoded, by the numbers of its tags; empty where it is broken."""
+    return image.info.get(_TAGS_KEPT, {})
+
+
+def _read_tags(image: Image.Image) -> dict[int, Any]:
+    try:
+        exif = image.getexif()
+        return {**exif, **exif.get_ifd(_EXIF)}
+    except Exception:  # a broken block of EXIF raises many kinds
+        return {}
 
 
 def check_upright(turn: int, path: str | Path) -> None:

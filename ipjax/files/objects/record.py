@@ -9,6 +9,8 @@ import numpy as np
 from ipjax.files.objects.pictures import decode_picture
 from ipjax.records import Similarity
 
+GUESS_DEVIATION = 0.35  # relative standard deviation of a guessed focal length: from a phone's 0.7 sides to a tele's 2
+
 
 @dataclasses.dataclass(frozen=True)
 class Reference:
@@ -19,7 +21,8 @@ class Reference:
         rotation, translation, scale: ``camera_from_mesh``, x_camera = scale * rotation @ x_mesh + translation; metres
             where `metric`, else in the arbitrary unit of the reconstruction.
         focal, centre, size: of the photo's camera, given or assumed; pixels of the photo as it was read.
-        camera_given: the user gave the camera; else it was assumed.
+        camera_source: where the camera is from: "given" by the user, told by "exif", or "guessed".
+        focal_deviation: relative standard deviation of the focal length; 0 where it was given.
         metric: the photo had depth, so the mesh is in metres and its size was measured.
         method: how the mesh was made: a name in `METHODS` of the reconstruction, such as "inflate".
         seen: share of the surface that the photo shows; the rest is guessed.
@@ -34,11 +37,27 @@ class Reference:
     focal: tuple[float, float]
     centre: tuple[float, float]
     size: tuple[int, int]  # width, height
-    camera_given: bool
+    camera_source: str
     metric: bool
     method: str
     seen: float
     picture: bytes | None = None
+    focal_deviation: float = 0.0
+
+    @property
+    def camera_given(self) -> bool:
+        """The user gave the camera."""
+        return self.camera_source == "given"
+
+    def describe_camera(self) -> str:
+        """The focal length, how far it may be off, and where it is from, in words."""
+        sources = {"given": "given", "exif": "as the photo's EXIF tells", "guessed": "guessed"}
+        off = f" ± {self.focal_deviation:.0%}" if self.focal_deviation else ""
+        return f"focal length {self.focal[0]:.0f} px{off}, {sources.get(self.camera_source, self.camera_source)}"
+
+    def camera_as_json(self) -> dict[str, Any]:
+        """What `describe_camera` tells, for programs."""
+        return {"source": self.camera_source, "focal_px": self.focal[0], "focal_deviation": self.focal_deviation}
 
     @property
     def camera_from_mesh(self) -> Similarity:
@@ -53,6 +72,7 @@ class Reference:
             entry
             | {"rotation": np.asarray(self.rotation, float).tolist()}
             | {"translation": np.asarray(self.translation, float).tolist()}
+            | {"camera_given": self.camera_given}  # for readers that know no other sources
         )
 
     @staticmethod
@@ -65,6 +85,11 @@ class Reference:
             raise ValueError("the reference camera is not finite")
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
             raise ValueError("the reference camera's pose is no rotation")
+        # Files of before told only whether the camera was given; how far it is off, they did not say.
+        given = bool(entry["camera_given"])
+        deviation = float(entry.get("focal_deviation", 0.0 if given else GUESS_DEVIATION))
+        if not (np.isfinite(deviation) and deviation >= 0):
+            raise ValueError("the deviation of the reference's focal length is not a positive number")
         return Reference(
             file=str(entry["file"]),
             sha256=str(entry["sha256"]),
@@ -74,7 +99,8 @@ class Reference:
             focal=(numbers[0], numbers[1]),
             centre=(numbers[2], numbers[3]),
             size=(int(entry["size"][0]), int(entry["size"][1])),
-            camera_given=bool(entry["camera_given"]),
+            camera_source=str(entry.get("camera_source", "given" if given else "guessed")),
+            focal_deviation=deviation,
             metric=bool(entry["metric"]),
             method=str(entry["method"]),
             seen=float(entry["seen"]),

@@ -7,6 +7,7 @@ axes (x right, y down, z ahead), origin at the centre of the bounding box.
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from ipjax.files.objects.record import GUESS_DEVIATION
 from ipjax.onboarding.reconstruction.outline import GRID, solve_poisson, trace_outline
 from ipjax.onboarding.reconstruction.result import Reconstruction
 from ipjax.onboarding.reconstruction.sheets import focal_and_centre, join_sheets
@@ -37,7 +38,9 @@ def inflate_photo(
     focal, centre = focal_and_centre(camera) if camera is not None else guess_camera(mask)
     report = ["the silhouette was inflated: the front bulges as the outline suggests, the back mirrors it (guessed)"]
     if camera is None:
-        report.append(f"no camera given: a focal length of {focal[0]:.0f} px was assumed")
+        report.append(
+            f"no camera and no EXIF tells the focal length: {focal[0]:.0f} px were guessed (± {GUESS_DEVIATION:.0%})"
+        )
     outline = trace_outline(mask, grid)
     half = bulge(outline.inside, roundness) * outline.step / focal.mean()
     half = np.maximum(half, 0.1 * outline.step / focal.mean())

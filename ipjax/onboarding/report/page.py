@@ -113,9 +113,7 @@ def _list_facts(templates: Templates, info: ObjectInfo, found: Findings) -> list
     rows.append(("templates", f"{len(covered)}, of {int(covered.min())} to {int(covered.max())} patches"))
     if info.reference is not None:
         rows.append(("seen in the photo", f"{info.reference.seen:.0%} of the surface"))
-        given = "given" if info.reference.camera_given else "assumed"
-        focal = info.reference.focal
-        rows.append(("camera of the photo", f"{given}, focal length {focal[0]:.0f} px"))
+        rows.append(("camera of the photo", info.reference.describe_camera()))
     rows.append(("texture", f"{found.texture:.1f} CIELAB units within small windows"))
     return rows
 
