@@ -1,6 +1,7 @@
 """What a wrong focal length of the photo costs, for objects from a photo without depth.
 
     python -m benchmarks.photo_focal [--data FOLDER] [--pairs 20] [--page benchmarks/results/focal.md]
+    python -m benchmarks.photo_focal --table [--page benchmarks/results/focal.md]
 
 The references and queries of `benchmarks.photo_pairs`, of another seed than its page, seen less than 60° apart. Each
 object is made several times from the same photo, whose camera is said to have so many times its true focal length, and
@@ -186,11 +187,13 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=20)
     parser.add_argument("--output", type=Path, default=Path("build/photo_focal.jsonl"), help="lines of JSON")
     parser.add_argument("--page", type=Path, help="write the tables here, too, with what they rest on")
+    parser.add_argument("--table", action="store_true", help="measure nothing, show the lines that are there")
     parser.add_argument("--weights", help="of the encoder (default: the best that is here)")
     options = parser.parse_args()
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    made = synthetic_groups(10 * QUERIES * options.pairs, options.data, SEED, QUERIES)
-    run(choose(made, options.pairs), options.output, options.weights)
+    if not options.table:
+        made = synthetic_groups(10 * QUERIES * options.pairs, options.data, SEED, QUERIES)
+        run(choose(made, options.pairs), options.output, options.weights)
     rows = [parse_json(line) for line in read_lines(options.output)]
     print(f"\n{table(rows)}\n\n{compare(rows)}")
     if options.page:

@@ -249,9 +249,9 @@ def _accept(photo: Photo, mask: np.ndarray, method: str, attempts: list) -> Fore
         {
             "given": "the mask was given",
             "alpha": "the mask is the photo's transparency",
-            "grabcut": "the mask was cut out by GrabCut from the box or click",
+            "grabcut": "the mask was cut out by GrabCut from the box or click: the report shows how well",
             "background": "the mask is what differs from the plain background",
-            "matting": "the mask was cut out by the package rembg, which takes what stands out",
+            "matting": "the mask was cut out by the package rembg: the report shows how well",
         }[method]
     )
     soft = photo.alpha if photo.alpha is not None and method == "alpha" else np.uint8(255) * mask.astype(np.uint8)

@@ -27,7 +27,7 @@ from ipjax.onboarding import photo as photos
 from ipjax.onboarding.foreground import Photo, read_photo
 from ipjax.onboarding.reconstruction.reconstruct import reconstruct_with_weights
 from ipjax.onboarding.report import findings
-from ipjax.onboarding.report.page import write_report
+from ipjax.onboarding.report.page import list_knowledge, write_report
 from ipjax.records import Similarity
 
 HEIGHT, WIDTH, FOCAL = 120, 160, 300.0
@@ -403,3 +403,17 @@ def test_exif_keeps_to_a_photo_that_is_reduced(tmp_path):
     assert prepared.foreground.mask.shape == (60, 80)
     np.testing.assert_allclose(prepared.camera.focal, ON_FILM * 100 / np.hypot(36, 24), rtol=1e-6)
     np.testing.assert_allclose(prepared.camera.centre, (39.5, 29.5))
+
+
+def test_the_report_says_what_is_known_and_what_is_guessed(metric, upright):
+    """With depth the front is measured; without, its depth is a guess, and no turn of it is called a symmetry."""
+    headings = lambda reference: {head: {name for name, _ in rows} for head, rows in list_knowledge(reference)}
+    true, guess = metric.info.reference, upright.info.reference
+    assert headings(true) == {"Known": {"colours", "outline", "front and size", "camera"}, "Guessed": {"back"}}
+    found = headings(guess)
+    assert {"outline", "directions"} <= found["Known"] and found["Guessed"] == {"depth", "back", "size", "camera"}
+    assert "as the photo's EXIF tells" in dict(list_knowledge(guess)[1][1])["camera"]
+    alike = (np.array([0.6, 0.6, 0.7]), ((180,), (), ()), 9.0)
+    told = findings.list_warnings(upright.templates, upright.info, *alike)
+    assert any("no depth" in line for line in told) and not any("symmetric" in line for line in told)
+    assert any("symmetric" in line for line in findings.list_warnings(metric.templates, metric.info, *alike))

@@ -169,8 +169,10 @@ def list_warnings(
         warnings.append(
             f"thin: {small / long:.0%} as thick as it is long; seen on edge it has hardly any surface to match"
         )
+    # A guessed back looks as its front does; whether the object does, a photo without depth does not tell.
+    without_depth = info.reference is not None and not info.reference.metric
     for axis, turns in enumerate(ambiguous):
-        if not turns:
+        if not turns or without_depth:
             continue
         name = name_axis(axis, sides)
         if len(turns) >= STEPS // 2 - 1:
@@ -186,7 +188,11 @@ def list_warnings(
         warnings.append(
             f"textureless: colours vary by {texture:.1f} CIELAB units in small windows; only the shape tells the pose"
         )
-    if info.reference is not None and info.reference.seen < 0.35:
+    if without_depth:
+        warnings.append(
+            "one photo, no depth: queries seen from beside (beyond some 60°) or from behind rest on what was guessed"
+        )
+    elif info.reference is not None and info.reference.seen < 0.35:
         warnings.append(
             f"only {info.reference.seen:.0%} of the surface was seen: queries from behind rest on what was guessed"
         )

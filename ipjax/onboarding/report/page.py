@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ipjax.files.meshes.mesh import Mesh
-from ipjax.files.objects.record import ObjectInfo
+from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.pages import embed_image, render_page
 from ipjax.files.storage.writing import write_text
 from ipjax.onboarding.reconstruction.methods import METHODS
@@ -53,7 +53,8 @@ def write_report(
     from_photo = reference is not None
     front = MESH_FRONT if reference is None else np.asarray(reference.rotation, np.float64)
     captions = MESH_SIDES if reference is None else {name: name for name in SIDES} | {"front": "front (the photo)"}
-    views = [("The mesh", mesh, False)]
+    guessed_shape = reference is not None and not reference.metric
+    views = [("The guessed shape, with the photo’s colours" if guessed_shape else "The mesh", mesh, False)]
     if from_photo:
         views.append(("What was seen and what was guessed", tint_guessed(mesh), True))
     page = render_page(
@@ -76,6 +77,8 @@ def write_report(
         ],
         seen_colour=_in_hexadecimal(SEEN),
         guessed_colour=_in_hexadecimal(GUESSED),
+        knowledge=[] if reference is None else list_knowledge(reference),
+        guessed_shape=guessed_shape,
         from_photo=from_photo,
         hemispheres=_list_viewpoints(templates, front, from_photo),
         turns=_plot_turns(found),
@@ -112,10 +115,44 @@ def _list_facts(templates: Templates, info: ObjectInfo, found: Findings) -> list
     covered = np.asarray(templates.patches.valid).sum(-1)
     rows.append(("templates", f"{len(covered)}, of {int(covered.min())} to {int(covered.max())} patches"))
     if info.reference is not None:
-        rows.append(("seen in the photo", f"{info.reference.seen:.0%} of the surface"))
+        guess = "" if info.reference.metric else " as it was guessed"
+        rows.append(("seen in the photo", f"{info.reference.seen:.0%} of the surface{guess}"))
         rows.append(("camera of the photo", info.reference.describe_camera()))
     rows.append(("texture", f"{found.texture:.1f} CIELAB units within small windows"))
     return rows
+
+
+def list_knowledge(reference: Reference) -> list[tuple[str, list[tuple[str, str]]]]:
+    """What a photo tells of an object and what was guessed: two headings, under each names and what is to be said."""
+    method = METHODS.get(reference.method)
+    learned = f" by {method.network}" if method and method.network else ""
+    known = [
+        ("colours", "of the side that the photo shows"),
+        ("outline", "as sharp as the mask above: where that is wrong, the object is"),
+    ]
+    focal = f"{reference.describe_camera()}"
+    back = ("back", f"what the photo does not show{learned or ': its front mirrored'}; trusted less, or not at all")
+    if reference.metric:
+        known += [
+            ("front and size", "measured by the depth image, in metres"),
+            ("camera", focal),
+        ]
+        return [("Known", known), ("Guessed", [back])]
+    known.append(("directions", "the ray of every pixel of it: rotation and sight line rest on these"))
+    guessed = [
+        (
+            "depth",
+            f"how far along its ray each point lies{learned or ', from the outline alone'}: easily off by a third of "
+            "the object’s size. It moves the place along the photo’s sight line, and turns nothing",
+        ),
+        back,
+        ("size", "not told by a photo at all: found with the pose, from the query’s depth"),
+    ]
+    if reference.camera_given:
+        known.append(("camera", focal))
+    else:
+        guessed.append(("camera", f"{focal}; a wrong one costs little"))
+    return [("Known", known), ("Guessed", guessed)]
 
 
 def _list_licences(info: ObjectInfo) -> list[tuple[str, str]]:
