@@ -128,7 +128,7 @@ def list_knowledge(reference: Reference) -> list[tuple[str, list[tuple[str, str]
     learned = f" by {method.network}" if method and method.network else ""
     known = [
         ("colours", "of the side that the photo shows"),
-        ("outline", "as sharp as the mask above: where that is wrong, the object is"),
+        ("outline", "as good as the mask above: where that is wrong, give another (--mask, --box)"),
     ]
     focal = f"{reference.describe_camera()}"
     back = ("back", f"what the photo does not show{learned or ': its front mirrored'}; trusted less, or not at all")
