@@ -90,6 +90,8 @@ class ResectConfig(eqx.Module):
 
     views: int = _static(12, least=1)  # of the object whose pairs are kept
     pairs: int = _static(256, least=3)  # most pairs of each
+    beside: int = _static(6)  # directions beside its own from which the query is drawn to be matched, too
+    tilt: float = 0.7  # rad (40°): by which they are turned
     count: int = _static(1024, least=1)  # minimal sets of each
     keep: int = _static(4, least=1)  # hypotheses of each
     apart: float = 0.21  # rad (12°): hypotheses closer than this count as one
@@ -98,8 +100,8 @@ class ResectConfig(eqx.Module):
     scale_gate: tuple[float, float] = (0.45, 2.2)  # around the size that the areas of both outlines tell
     steps: int = _static(10)  # of Gauss and Newton
     drawn: int = _static(12, least=1)  # hypotheses of all views that are drawn
-    polished: int = _static(5, least=1)  # best of them that are refined on what their drawings match
-    rounds: int = _static(3)  # of it
+    polished: int = _static(4, least=1)  # best of them that are refined on what their drawings match
+    rounds: int = _static(2)  # of it
     window: float = 3.0  # patches in which it is
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn

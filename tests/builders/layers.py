@@ -16,6 +16,7 @@ ORDER = [
     ["ipjax.estimation.residuals"],
     [f"ipjax.estimation.{s}" for s in ("features", "matching", "alignment", "refinement", "scoring", "confidence")],
     ["ipjax.estimation.scene", "ipjax.estimation.photo.resection"],
+    ["ipjax.estimation.photo.drawing"],
     ["ipjax.estimation.photo.through_photo"],
     ["ipjax.estimation.pipeline"],
     # What cannot be jitted.

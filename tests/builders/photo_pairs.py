@@ -9,7 +9,8 @@ from builders.estimates import make_estimate
 
 from ipjax.config import OnboardConfig
 from ipjax.estimation.features import observe
-from ipjax.estimation.photo.resection import measure_sight, metres_per_unit, query_from_object, splat_query
+from ipjax.estimation.photo.drawing import splat_query
+from ipjax.estimation.photo.resection import measure_sight, metres_per_unit, query_from_object
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.frames import frame_turned
 from ipjax.onboarding.foreground import Photo

@@ -17,16 +17,15 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ipjax.config import Config
 from ipjax.estimation.confidence import find_rival, probability, rotation_ambiguity
 from ipjax.estimation.features import object_features
+from ipjax.estimation.photo.drawing import compare_drawings, look_from_beside, splat_query
 from ipjax.estimation.photo.resection import (
-    compare_drawings,
+    Look,
     match_photo,
     measure_sight,
     metres_per_unit,
     patch_normals,
     query_from_object,
-    rays_of,
     resect,
-    splat_query,
 )
 from ipjax.estimation.scene import SceneGrid
 from ipjax.estimation.scoring import closeness, depth_agreement
@@ -54,13 +53,16 @@ def estimate_through_photo(
     query = eqx.tree_at(lambda q: q.patches.features, query, object_features(query.patches.features, templates))
     sight = measure_sight(reference, query)
     with jax.named_scope("match"):
-        matches, pairs = match_photo(templates, query, config.match.cycle, resection)
-        rays = rays_of(reference, pairs.object)
-    scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
-    side = round(query.patches.valid.shape[0] ** 0.5)
+        scene = SceneGrid(query, config.score.resolution, config.refine.silhouette)
+        side = round(query.patches.valid.shape[0] ** 0.5)
+        looks = jax.tree.map(lambda x: x[None], Look(query.patches, patch_normals(scene.cloud, side, side)))
+        if encoder is not None and resection.beside:
+            beside = look_from_beside(encoder, templates, query, sight, resection)
+            looks = jax.tree.map(lambda *x: jnp.concatenate(x), looks, beside)
+        sightings = lax.map(lambda look: match_photo(templates, look, config.match.cycle, resection), looks)
+        pairs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sightings)
     with jax.named_scope("resect"):
-        normals = patch_normals(scene.cloud, side, side)[matches.query]
-        found = resect(pairs, rays, normals, sight, key, resection)
+        found = resect(pairs, sight, key, resection)
     with jax.named_scope("draw"):
         if encoder is None:
             look = jax.vmap(lambda turn, shift: splat_query(reference, query, turn, shift, sight)[1])
@@ -68,15 +70,15 @@ def estimate_through_photo(
             # Each candidate is judged by the pairs of all views.
             pool = lambda x: x.reshape(-1, *x.shape[2:])
             every = lambda x: jnp.broadcast_to(pool(x), (found.support.shape[0], *pool(x).shape))
-            points, where, weight = every(pairs.camera), every(rays), every(pairs.weight)
+            points, where, weight = every(pairs.points), every(pairs.rays), every(pairs.weight)
             overlap = shared = jnp.ones_like(found.support)
             colour, score = jnp.zeros_like(found.support), found.support
         else:
             compared = compare_drawings(encoder, templates, query, found, sight, resection)
             camera, drawn = (compared.rotation, compared.translation), compared.drawing
             points, where, weight = drawn.points, drawn.rays, drawn.weight
-            depth, overlap, colour, shared = drawn.depth, drawn.overlap, drawn.colour, drawn.shared
-            score = overlap
+            depth, overlap, score = drawn.depth, drawn.overlap * root(drawn.contained), compared.score
+            colour, shared = drawn.colour, drawn.shared
         units, front, sized = jax.vmap(lambda one: metres_per_unit(reference, one))(depth)
         score = jnp.where(sized, score, -1)
         behind = jnp.zeros_like(units)
@@ -126,7 +128,7 @@ def estimate_through_photo(
         agreement=agreement,
         hypotheses=Hypotheses(poses, jnp.clip(score, 0, 1)),
         view=jnp.argmin(apart).astype(jnp.int32),
-        view_score=matches.ranking,
+        view_score=sightings.ranking[0],
         inliers=count,
         rmse=root(beside),
         success=success,

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from ipjax.estimation.photo.resection import measure_sight, splat_query
+from ipjax.estimation.photo.drawing import splat_query
+from ipjax.estimation.photo.resection import measure_sight
 from ipjax.records import PoseEstimate, Query, ReferenceView, Similarity, Templates
 
 _RATIOS = np.linspace(np.log(0.6), np.log(1.6), 41)  # of the photo's distance, where only a given size is known
