@@ -61,6 +61,8 @@ def estimate_through_photo(
             looks = jax.tree.map(lambda *x: jnp.concatenate(x), looks, beside)
         sightings = lax.map(lambda look: match_photo(templates, look, config.match.cycle, resection), looks)
         pairs = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), sightings)
+        # Patches of the query that match nothing show no object, whatever its depth looks like from elsewhere.
+        usable = usable & _has_pairs(sightings.rays[0], sightings.weight[0])
     with jax.named_scope("resect"):
         found = resect(pairs, sight, key, resection)
     with jax.named_scope("draw"):
@@ -133,6 +135,13 @@ def estimate_through_photo(
         rmse=root(beside),
         success=success,
     )
+
+
+def _has_pairs(rays: Float[Array, "v k 2"], weight: Float[Array, "v k"]) -> Bool[Array, ""]:
+    """Whether any view has three pairs that are not in one place of the photo."""
+    present = (weight > 0)[..., None]
+    wide = jnp.max(jnp.where(present, rays, -jnp.inf), axis=1) > jnp.min(jnp.where(present, rays, jnp.inf), axis=1)
+    return jnp.any((jnp.sum(weight > 0, axis=1, dtype=jnp.int32) >= 3) & jnp.all(wide, axis=-1))
 
 
 def _spread(
