@@ -83,8 +83,8 @@ def run(groups: list[Group], output: Path, weights: str | None = None) -> None:
             keys = [(str(told), group.object, query.name) for query in group.queries]
             if all(key in done for key in keys):
                 continue
-            given = {} if told == GUESSED else {"camera": Camera.from_matrix(refocus(ref.K, float(told)))}
-            made = onboard_photo(Photo(ref.rgb), encoder, mask=ref.mask, lrm="inflate", progress=False, **given)
+            camera = None if told == GUESSED else Camera.from_matrix(refocus(ref.K, float(told)))
+            made = onboard_photo(Photo(ref.rgb), encoder, mask=ref.mask, lrm="inflate", progress=False, camera=camera)
             assert made.reconstruction.camera is not None
             matrix = made.reconstruction.camera.to_matrix()
             estimator.objects = [(made.templates, made.info)]
