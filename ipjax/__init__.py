@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ipjax.estimation.pipeline import estimate
     from ipjax.files.cameras.intrinsics import Intrinsics
     from ipjax.files.cameras.reading import read_camera
+    from ipjax.files.images.candidates import read_candidates
     from ipjax.files.images.depth import read_depth
     from ipjax.files.images.masks import read_mask
     from ipjax.files.images.opening import read_rgb
@@ -90,6 +91,7 @@ __all__ = [
     "onboard_photo",
     "pad_templates",
     "read_camera",
+    "read_candidates",
     "read_depth",
     "read_mask",
     "read_results",
@@ -127,6 +129,7 @@ _HOMES = {
     "estimation.pipeline": ("estimate",),
     "files.cameras.intrinsics": ("Intrinsics",),
     "files.cameras.reading": ("read_camera",),
+    "files.images.candidates": ("read_candidates",),
     "files.images.depth": ("read_depth",),
     "files.images.masks": ("read_mask",),
     "files.images.opening": ("read_rgb",),

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ipjax.bop.masks import decode_rle
 from ipjax.bop.records import DatasetError, Target, TargetRow
+from ipjax.files.images.run_lengths import decode_rle
 from ipjax.files.storage.parsing import read_json
 
 

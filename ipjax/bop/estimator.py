@@ -21,7 +21,7 @@ from ipjax.transforms import Similarity
 
 SHARED = 512  # described crops kept for other configurations; about 1.5 MB each
 # The modules of this package that an estimate depends on: reading, and writing an estimate as a row.
-READERS = ("alignments", "dataset", "detections", "estimator", "masks", "objects", "records", "results")
+READERS = ("alignments", "dataset", "detections", "estimator", "objects", "records", "results")
 
 
 def hash_code() -> str:

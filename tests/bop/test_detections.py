@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ipjax.bop.detections import detected_targets, read_detections
-from ipjax.bop.masks import encode_rle
 from ipjax.bop.records import DatasetError, TargetRow
+from ipjax.files.images.run_lengths import encode_rle
 
 
 def test_detections_and_the_best_of_them(tmp_path):

@@ -21,21 +21,37 @@ def read_mask(path: str | Path, label: int | None = None) -> np.ndarray:
         ValueError: missing, unreadable, several labels and none asked for, a photo; names the file.
     """
     path = Path(path)
-    if path.suffix.lower() == ".npy":
-        mask = load_npy(path)
-    else:
-        image = open_image(path)
-        check_upright(get_orientation(image), path)
-        mask = _read_values(image, label)
-        if label is not None and image.format == "PPM" and mask.ndim == 2:
-            mask = undo_stretching(image, path)
+    mask = load_npy(path) if path.suffix.lower() == ".npy" else _read_values(path, label)
     try:
         return as_mask(mask, label)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _read_values(image: Image.Image, label: int | None) -> np.ndarray:
+def read_values(path: str | Path) -> np.ndarray:
+    """The numbers of a mask's image: labels as they are stored, a palette of more than two as its entries.
+
+    Raises:
+        ValueError: as `read_mask`, but for what the numbers say.
+    """
+    path = Path(path)
+    values = _read_values(path, None)
+    try:
+        as_mask(values)
+    except ValueError:
+        labels = _read_values(path, 0)
+        return labels if labels.ndim == 2 else values
+    return values
+
+
+def _read_values(path: Path, label: int | None) -> np.ndarray:
+    image = open_image(path)
+    check_upright(get_orientation(image), path)
+    values = _convert(image, label)
+    return undo_stretching(image, path) if label is not None and image.format == "PPM" and values.ndim == 2 else values
+
+
+def _convert(image: Image.Image, label: int | None) -> np.ndarray:
     if image.mode in ("P", "PA") and label is not None:
         return np.array(image.getchannel(0) if image.mode == "PA" else image)
     if image.mode in ("P", "PA"):

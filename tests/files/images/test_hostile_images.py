@@ -18,7 +18,8 @@ from PIL import Image
 CHILD = """
 import json, resource, sys
 from pathlib import Path
-from ipjax.bop import alignments, dataset, detections, masks
+from ipjax.bop import alignments, dataset, detections
+from ipjax.files.images import run_lengths
 from ipjax.files.cameras.reading import read_camera
 from ipjax.onboarding.foreground import read_photo
 from ipjax.files.images.depth import read_depth
@@ -27,7 +28,7 @@ from ipjax.files.images.opening import read_rgb, read_size
 from ipjax.files.settings import read_config
 
 def read_rle(path):
-    return masks.decode_rle(json.loads(Path(path).read_text()))
+    return run_lengths.decode_rle(json.loads(Path(path).read_text()))
 
 def read_truths(path):
     scene = Path(path).parent / "bop" / "test" / "000001"

@@ -1,4 +1,4 @@
-"""COCO's run-length masks, in which BOP keeps segmentations.
+"""COCO's run-length masks, in which BOP, CNOS, SAM-6D and SAM keep segmentations.
 
 https://github.com/cocodataset/cocoapi/blob/master/common/maskApi.c describes the text form.
 """
@@ -11,6 +11,8 @@ from ipjax.files.images.masks import as_mask
 from ipjax.files.images.opening import BYTES_PER_PIXEL
 from ipjax.files.storage.budget import check_budget
 
+_LONGEST = 55  # bits before the last five of a number: more would overflow, and without end take quadratic time
+
 
 def decode_rle(segmentation: dict) -> np.ndarray:
     """Bool mask [h, w] of a COCO run-length encoding ``{"size": [h, w], "counts": …}``.
@@ -21,11 +23,15 @@ def decode_rle(segmentation: dict) -> np.ndarray:
     try:
         height, width = (int(x) for x in segmentation["size"])
         counts = segmentation["counts"]
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise ValueError("a run-length mask needs size [height, width] and counts") from None
     # No mask is larger than an image may be.
     check_budget(BYTES_PER_PIXEL * max(height, 0) * max(width, 0), f"a run-length mask of {width} × {height} pixels")
-    runs = np.asarray(_decompress(counts) if isinstance(counts, str | bytes) else counts)
+    if isinstance(counts, str | bytes):
+        counts = _decompress(counts)
+    # A list in the list would make NumPy speak of its own affairs.
+    whole = isinstance(counts, list | tuple | np.ndarray) and not any(isinstance(run, list | dict) for run in counts)
+    runs = np.asarray(counts) if whole else np.zeros((1, 1))
     if runs.ndim != 1 or (runs.size and runs.dtype.kind not in "ui") or (runs < 0).any():
         raise ValueError("the counts of a run-length mask must be whole numbers, not negative")
     # A single run beyond the mask could make the sum overflow.
@@ -61,6 +67,8 @@ def _decompress(text: str | bytes) -> list[int]:
             bits = data[at] - 48
             if not 0 <= bits < 64:
                 raise ValueError("a compressed mask holds a character that is none of COCO's")
+            if shift > _LONGEST:
+                raise ValueError("a compressed mask holds a number that no image has pixels for")
             value |= (bits & 31) << shift
             more = bool(bits & 32)
             at += 1

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from ipjax.bop.masks import decode_rle, encode_rle
+from ipjax.files.images.run_lengths import decode_rle, encode_rle
 
 
 @given(hnp.arrays(bool, (7, 9)))
@@ -26,6 +26,15 @@ def test_long_runs_and_cocos_text():
     assert encode_rle(one)["counts"] == "Q11R2"
     assert encode_rle(one, compressed=False)["counts"] == [33, 1, 66]
     np.testing.assert_array_equal(decode_rle({"size": [2, 2], "counts": [0, 1, 3]}), [[True, False], [False, False]])
+
+
+def test_pycocotools_text():
+    """What pycocotools 2.0.11 writes for this mask (``encode`` of an array in Fortran's order)."""
+    mask = np.zeros((23, 31), bool)
+    mask[4:9, 3:20] = mask[12:20, 10:13] = mask[0, 30] = True
+    text = "Y25b00000000000000A34ML34ML34M;00000000000R7LRI"
+    assert encode_rle(mask)["counts"] == text
+    np.testing.assert_array_equal(decode_rle({"size": [23, 31], "counts": text.encode()}), mask)
 
 
 @pytest.mark.parametrize(
