@@ -24,6 +24,7 @@ from ipjax.metrics.symmetries import SYMMETRY_STEP, discretise_symmetries
 from ipjax.transforms import Similarity
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+TARGETS = ("test_targets_bop19.json", "test_targets_bop24.json")
 VISIBLE = 0.1  # share of an instance that must be visible for it to be a target (enumerate_test_targets.py)
 
 
@@ -47,7 +48,8 @@ class Dataset:
         sensor: suffix of the sensor's files where there are several ("photoneo": ``rgb_photoneo``,
             ``scene_camera_photoneo.json``); files without the suffix are the fallback.
         models: another root to take ``models``, ``models_eval`` from.
-        targets: name of the file of targets.
+        targets: name of the file of targets; default: that of 2019 to 2023 (scene, image, object, count), or of 2024
+            (scene, image) where there is only this one.
 
     Raises DatasetError where there is no such folder.
     """
@@ -59,13 +61,14 @@ class Dataset:
         *,
         sensor: str = "",
         models: str | Path | None = None,
-        targets: str = "test_targets_bop19.json",
+        targets: str | None = None,
     ):
         self.root = Path(root)
         self.split = split
         self.sensor = sensor
         self.models_root = Path(models) if models is not None else self.root
-        self.targets_file = self.root / targets
+        listed = [name for name in TARGETS if (self.root / name).is_file()]
+        self.targets_file = self.root / (targets or (listed or TARGETS)[0])
         self.name = self.root.name
         if not self.root.is_dir():
             raise DatasetError(f"{self.root}: no such data set folder")
@@ -114,8 +117,8 @@ class Dataset:
             except ValueError as error:
                 raise DatasetError(f"{at}: cam_R_m2c: {error}") from None
             translation = _numbers(item, "cam_t_m2c", 3, at) * MM
-            visible, box = shares[index] if shares is not None and index < len(shares) else (-1.0, None)
-            found.append(Truth(item["obj_id"], index, rotation, translation, visible, box))
+            about = shares[index] if shares is not None and index < len(shares) else (-1.0, None, None)
+            found.append(Truth(item["obj_id"], index, rotation, translation, *about))
         return found
 
     def frame(self, scene_id: int, im_id: int) -> Frame:
@@ -139,6 +142,10 @@ class Dataset:
     def has_depth(self, scene_id: int) -> bool:
         """Whether the scene has a folder of depth images."""
         return self._folder(scene_id, "depth").is_dir()
+
+    def has_silhouettes(self, scene_id: int) -> bool:
+        """Whether the scene has a folder of masks of whole silhouettes."""
+        return self._folder(scene_id, "mask").is_dir()
 
     def image_path(self, scene_id: int, im_id: int) -> Path:
         """The file of the colour image, or of the grey one where there is no colour."""
@@ -178,24 +185,49 @@ class Dataset:
         is visible to a tenth or more."""
         if not self.targets_file.is_file():
             return self._derived_targets()
+        found, seen = [], set()
+        for number, row in enumerate(self._target_rows):
+            where = f"{self.targets_file}, entry {number}"
+            if "obj_id" not in row:
+                found += self._visible_targets(row["scene_id"], row["im_id"])
+                continue
+            target = TargetRow(row["scene_id"], row["im_id"], row["obj_id"], row.get("inst_count", 1))
+            key = (target.scene_id, target.im_id, target.obj_id)
+            if key in seen:
+                raise DatasetError(f"{where}: scene, image and object occur twice: {key}")
+            seen.add(key)
+            found.append(target)
+        return found
+
+    @cached_property
+    def target_images(self) -> list[tuple[int, int]]:
+        """(scene, image) of every image that the benchmark asks for, also of those that show no target."""
+        if not self.targets_file.is_file():
+            return sorted(self.targets_by_image())
+        return sorted({(row["scene_id"], row["im_id"]) for row in self._target_rows})
+
+    @cached_property
+    def names_objects(self) -> bool:
+        """Whether a method is told which objects an image shows (6-D localisation), or not (6-D detection)."""
+        return not self.targets_file.is_file() or all("obj_id" in row for row in self._target_rows)
+
+    @cached_property
+    def _target_rows(self) -> list[dict[str, int]]:
         rows = self._json(self.targets_file)
         if not isinstance(rows, list):
             raise DatasetError(f"{self.targets_file}: a list of targets is expected")
-        found, seen = [], set()
+        found = []
         for number, row in enumerate(rows):
             try:
-                target = TargetRow(
-                    int(row["scene_id"]), int(row["im_id"]), int(row["obj_id"]), int(row.get("inst_count", 1))
-                )
-            except (KeyError, TypeError, ValueError, AttributeError):
+                names = ("scene_id", "im_id", "obj_id", "inst_count")
+                needed = names[: 3 if "inst_count" in row else 2]
+                kept = {name: int(row[name]) for name in names if name in row or name in needed}
+            except (KeyError, TypeError, ValueError):
                 raise DatasetError(
-                    f"{self.targets_file}, entry {number}: scene_id, im_id and obj_id must be there and be integers"
+                    f"{self.targets_file}, entry {number}: scene_id and im_id must be there, and they, obj_id and "
+                    "inst_count be integers"
                 ) from None
-            key = (target.scene_id, target.im_id, target.obj_id)
-            if key in seen:
-                raise DatasetError(f"{self.targets_file}, entry {number}: scene, image and object occur twice: {key}")
-            seen.add(key)
-            found.append(target)
+            found.append(kept)
         return found
 
     def targets_by_image(self) -> dict[tuple[int, int], list[TargetRow]]:
@@ -217,15 +249,16 @@ class Dataset:
         return found
 
     def _derived_targets(self) -> list[TargetRow]:
-        found = []
-        for scene in self.scenes():
-            for image in self.images(scene):
-                counts: dict[int, int] = {}
-                for truth in self.truths(scene, image):
-                    if truth.visible < 0 or truth.visible >= VISIBLE:
-                        counts[truth.obj_id] = counts.get(truth.obj_id, 0) + 1
-                found += [TargetRow(scene, image, obj, count) for obj, count in sorted(counts.items())]
-        return found
+        return [
+            t for scene in self.scenes() for image in self.images(scene) for t in self._visible_targets(scene, image)
+        ]
+
+    def _visible_targets(self, scene: int, image: int) -> list[TargetRow]:
+        counts: dict[int, int] = {}
+        for truth in self.truths(scene, image):
+            if truth.visible < 0 or truth.visible >= VISIBLE:
+                counts[truth.obj_id] = counts.get(truth.obj_id, 0) + 1
+        return [TargetRow(scene, image, obj, count) for obj, count in sorted(counts.items())]
 
     # Models
 
@@ -318,16 +351,14 @@ class Dataset:
             raise DatasetError(f"{where}: a {kind.__name__} is expected")
         return entry, where
 
-    def _visible(self, scene_id: int, im_id: int) -> list[tuple[float, tuple[int, int, int, int] | None]] | None:
+    def _visible(self, scene_id: int, im_id: int) -> list[tuple[float, Any, Any]] | None:
         path = self._file(scene_id, "scene_gt_info")
         if not path.is_file():
             return None
         entry, where = self._entry(scene_id, im_id, "scene_gt_info", list)
         try:
-            return [
-                (float(item.get("visib_fract", -1.0)), tuple(item["bbox_visib"]) if "bbox_visib" in item else None)
-                for item in entry
-            ]
+            boxes = lambda item: (tuple(item[n]) if n in item else None for n in ("bbox_visib", "bbox_obj"))
+            return [(float(item.get("visib_fract", -1.0)), *boxes(item)) for item in entry]
         except (TypeError, ValueError, AttributeError):
             raise DatasetError(f"{where}: visib_fract must be a number") from None
 

@@ -1,16 +1,28 @@
-"""Detections and segmentations in BOP's JSON form, and the targets that they give an estimator."""
+"""Detections in two dimensions, as BOP's challenges keep them: reading, writing, and the targets that they give.
 
+A JSON file is a list of scene_id, image_id, category_id, score, bbox (x, y, width, height of the whole silhouette),
+segmentation (run lengths of what is visible) and time (seconds for the whole image, the same in all of its entries);
+https://bop.felk.cvut.cz/challenges/bop-challenge-2022/, section 5.1. Files of CNOS and SAM-6D (npz, one an image) are
+read as well.
+"""
+
+import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from ipjax.bop.records import DatasetError, Target, TargetRow
-from ipjax.files.images.run_lengths import decode_rle
-from ipjax.files.storage.parsing import read_json
+from ipjax.files.images.annotations import Annotation, decode_segmentation, read_annotations
+from ipjax.files.images.run_lengths import encode_rle
+from ipjax.files.storage.writing import write_text
+
+TIME_SLACK = 1e-3  # seconds by which times of one image may differ (inout.py, check_consistent_timings)
 
 
 @dataclass(frozen=True)
@@ -21,47 +33,112 @@ class Detection:
     im_id: int
     obj_id: int
     score: float
-    box: tuple[float, float, float, float] | None
-    time: float
-    segmentation: dict | None = field(repr=False, default=None)
+    box: tuple[float, float, float, float] | None  # x, y, width, height; pixels
+    time: float  # for the whole image, seconds; −1 = unknown
+    segmentation: Any = field(repr=False, default=None)  # of any form that `decode_segmentation` knows
+    size: tuple[int, int] | None = field(repr=False, default=None)  # height, width; polygons need it
 
     @cached_property
     def mask(self) -> np.ndarray | None:
         """The segmentation as bool [h, w]; None where there is only a box."""
-        return None if self.segmentation is None else decode_rle(self.segmentation)
+        return None if self.segmentation is None else decode_segmentation(self.segmentation, self.size)
 
 
-def read_detections(path: str | Path) -> list[Detection]:
-    """Detections or segmentations in BOP's JSON form (scene_id, image_id, category_id, score, bbox, segmentation)."""
+def as_detection(
+    scene_id: int,
+    im_id: int,
+    obj_id: int,
+    score: float,
+    mask: Bool[np.ndarray, "h w"],
+    time: float = -1.0,
+    box: Sequence[float | int] | None = None,
+) -> Detection:
+    """A mask as a detection; without a ``box`` (of the whole silhouette, pixels) it gets that of the mask.
+
+    Raises ValueError where the mask is empty.
+    """
+    if box is None:
+        box = box_of(mask)
+        if box is None:
+            raise ValueError(f"the mask of object {obj_id} in scene {scene_id}, image {im_id} is empty")
+    x, y, width, height = map(float, box)
+    return Detection(scene_id, im_id, obj_id, float(score), (x, y, width, height), float(time), encode_rle(mask))
+
+
+def box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int] | None:
+    """x, y, width, height of the smallest box around a mask, pixels; None where the mask is empty."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not rows.size:
+        return None
+    left, top = int(columns[0]), int(rows[0])
+    return left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
+
+
+def read_detections(path: str | Path, *, problems: list[str] | None = None) -> list[Detection]:
+    """Detections or segmentations of a BOP JSON file (also .json.gz), of CNOS's npz, or of a folder of such npz.
+
+    Raises DatasetError (file, entry, what is wrong) for what is no such file, for entries without scene, image or
+    category, numbers that are not finite, boxes of negative size, and times that differ within an image. Give a list as
+    ``problems`` to have such entries left out, and the sentences collected there, instead.
+    """
     path = Path(path)
-    try:
-        entries = read_json(path)
-    except ValueError as error:
-        raise DatasetError(str(error)) from None
-    if not isinstance(entries, list):
-        raise DatasetError(f"{path}: a list of detections is expected")
-    found = []
-    for number, entry in enumerate(entries):
-        where = f"{path}, entry {number}"
+    files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+    if not files:
+        raise DatasetError(f"{path}: there are no npz files of detections in this folder")
+    found: list[Detection] = []
+    times: dict[tuple[int, int], float] = {}
+    for file in files:
         try:
-            box = entry.get("bbox")
-            detection = Detection(
-                int(entry["scene_id"]),
-                int(entry["image_id"]),
-                int(entry["category_id"]),
-                float(entry.get("score", 1.0)),
-                None if box is None else (float(box[0]), float(box[1]), float(box[2]), float(box[3])),
-                float(entry.get("time", -1.0)),
-                entry.get("segmentation"),
-            )
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-            raise DatasetError(
-                f"{where}: a detection needs scene_id, image_id, category_id, score ({error!r})"
-            ) from None
-        if not math.isfinite(detection.score):
-            raise DatasetError(f"{where}: the score is not a finite number")
-        found.append(detection)
+            annotations = read_annotations(file, problems=problems)
+        except ValueError as error:
+            raise DatasetError(str(error)) from None
+        for annotation in annotations:
+            try:
+                detection = _as_detection(annotation)
+                first = times.setdefault((detection.scene_id, detection.im_id), detection.time)
+                if abs(first - detection.time) > TIME_SLACK:
+                    raise ValueError(
+                        f"time is for the whole image: {detection.time:g} s here, but {first:g} s in another entry of "
+                        f"scene {detection.scene_id}, image {detection.im_id}"
+                    )
+            except ValueError as error:
+                message = f"{annotation.where}: {error}"
+                if problems is None:
+                    raise DatasetError(message) from None
+                problems.append(message)
+            else:
+                found.append(detection)
     return found
+
+
+def write_detections(path: str | Path, detections: Iterable[Detection]) -> Path:
+    """Write detections as BOP's toolkit does: a JSON list, an entry a line; whole or not at all.
+
+    A missing box is ``[]``, a missing mask ``{}``. Raises ValueError for numbers that are not finite, times that are
+    negative (but −1, unknown) or differ within an image: the challenge refuses such files.
+    """
+    lines = []
+    times: dict[tuple[int, int], float] = {}
+    for one in detections:
+        where = f"a detection of scene {one.scene_id}, image {one.im_id}, object {one.obj_id}"
+        if not all(map(math.isfinite, (one.score, one.time, *(one.box or ())))):
+            raise ValueError(f"{where} is not finite")
+        if one.time < 0 and one.time != -1:
+            raise ValueError(f"{where}: time must be seconds, or -1 where it is unknown, got {one.time:g}")
+        first = times.setdefault((one.scene_id, one.im_id), one.time)
+        if abs(first - one.time) > TIME_SLACK:
+            raise ValueError(f"{where}: time is for the whole image: {one.time:g} s, but {first:g} s in another")
+        entry = {
+            "scene_id": int(one.scene_id),
+            "image_id": int(one.im_id),
+            "category_id": int(one.obj_id),
+            "score": float(one.score),
+            "bbox": [] if one.box is None else [int(x) if float(x).is_integer() else float(x) for x in one.box],
+            "segmentation": {} if one.mask is None else encode_rle(one.mask, compressed=False),
+            "time": float(one.time),
+        }
+        lines.append(json.dumps(entry, sort_keys=True))
+    return write_text(path, "[\n" + ",\n".join(f"  {line}" for line in lines) + "\n]", parents=True)
 
 
 def detected_targets(detections: Iterable[Detection], rows: Sequence[TargetRow]) -> list[Target]:
@@ -73,3 +150,25 @@ def detected_targets(detections: Iterable[Detection], rows: Sequence[TargetRow])
         mine.sort(key=lambda d: -d.score)
         found += [Target(d.obj_id, d.mask, d.score) for d in mine[: row.count]]
     return found
+
+
+def every_target(detections: Iterable[Detection], objects: Iterable[int] | None, most: int = 100) -> list[Target]:
+    """Of one image every detection of these objects as a target, the surest first: the task of 6-D detection, in which
+    nobody says what is there. BOP counts the ``most`` estimates of an image."""
+    wanted = None if objects is None else set(objects)
+    mine = sorted((d for d in detections if wanted is None or d.obj_id in wanted), key=lambda d: -d.score)
+    return [Target(d.obj_id, d.mask, d.score) for d in mine[:most]]
+
+
+def _as_detection(one: Annotation) -> Detection:
+    for name in ("scene_id", "image_id", "category_id"):
+        if getattr(one, name) is None:
+            raise ValueError(f"a detection needs scene_id, image_id, category_id, score ({name} is missing)")
+    assert one.scene_id is not None and one.image_id is not None and one.category_id is not None
+    if one.time < 0 and one.time != -1:
+        raise ValueError(f"time must be seconds, or -1 where it is unknown, got {one.time:g}")
+    segmentation = one.segmentation
+    if isinstance(segmentation, np.ndarray):  # those of a data set would not fit into memory
+        segmentation = encode_rle(decode_segmentation(segmentation))
+    score = 1.0 if one.score is None else one.score
+    return Detection(one.scene_id, one.image_id, one.category_id, score, one.box, one.time, segmentation, one.size)

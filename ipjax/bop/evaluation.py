@@ -9,7 +9,7 @@ import numpy as np
 
 from ipjax.bop.alignments import align, describe_alignments
 from ipjax.bop.dataset import Dataset
-from ipjax.bop.detections import Detection, detected_targets
+from ipjax.bop.detections import Detection, detected_targets, every_target
 from ipjax.bop.journal import Journal, locked_folder
 from ipjax.bop.records import DatasetError, Estimate, Frame, Target, check_rotation
 from ipjax.bop.results import ResultRow, as_row, sized_path, write_results
@@ -56,7 +56,8 @@ def evaluate(
             ``score.json`` and ``score.txt``.
         settings: what the results depend on (configuration, weights, meshes), as plain JSON; a folder with results of
             other settings is refused.
-        detections: masks to use; default: the annotated visible masks.
+        detections: masks to use; default: the annotated visible masks. Of each object that the targets name the best,
+            as many as there are instances; where the targets name none (BOP 2024), every detection of these objects.
         alignments, aligned_by: for objects whose estimates are of a reconstructed mesh; see `score`.
         on_error: "raise" stops at a damaged file or a failing estimator; "skip" records the failure, which counts as a
             miss, and goes on; the next call tries it again.
@@ -72,7 +73,9 @@ def evaluate(
         image: [t for t in rows if chosen is None or t.obj_id in chosen]
         for image, rows in dataset.targets_by_image().items()
     }
-    images = {image: rows for image, rows in images.items() if rows}
+    if not dataset.names_objects:  # nobody says what is in an image
+        images = {image: images.get(image, []) for image in dataset.target_images}
+    images = {image: rows for image, rows in images.items() if rows or not dataset.names_objects}
     if not images:
         raise DatasetError(f"{dataset.targets_file}: there are no targets of the objects asked for")
     alignments = dict(alignments or {})
@@ -103,7 +106,8 @@ def evaluate(
                     given = [t for t in dataset.given_targets(*image) if chosen is None or t.obj_id in chosen]
                     before = 0.0
                 else:
-                    given = detected_targets(found, images[image])
+                    is_told = dataset.names_objects
+                    given = detected_targets(found, images[image]) if is_told else every_target(found, chosen)
                     before = max([d.time for d in found if d.time > 0], default=0.0)
                 start, uncounted = time.perf_counter(), _uncounted(estimator)
                 estimates = list(estimator(frame, given)) if given else []

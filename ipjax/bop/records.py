@@ -67,6 +67,7 @@ class Truth:
     translation: np.ndarray  # 3, metres, float64
     visible: float = 1.0  # share of the silhouette that is visible (visib_fract); −1 = unknown
     box: tuple[int, int, int, int] | None = None  # visible, x y width height
+    whole: tuple[int, int, int, int] | None = None  # of the silhouette, what is hidden or outside the image included
 
     @property
     def camera_from_object(self) -> Similarity[np.ndarray]:

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from ipjax.commands.interface import options
+from ipjax.commands.interface.candidates import MOST, check_any, estimate_best
 from ipjax.commands.interface.frames import FrameFiles, Images, choose_masks, list_frames, read_frame
 from ipjax.commands.interface.messages import Messages, in_one_line
-from ipjax.commands.interface.parser import add_command
+from ipjax.commands.interface.parser import add_command, parse_count
 
 EXAMPLES = """\
 examples:
@@ -16,13 +17,20 @@ examples:
   ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json \\
       --mask mug.png --mask box.png --overlay out.png       several objects: one mask (or box) each, in their order
   ipjax estimate mug.ipjax --rgb a.png --depth a.npy --camera 600,600,320,240 --box 210,130,90,120
+  ipjax estimate mug.ipjax --rgb a.png --depth a.png --camera camera.json --mask detections.json --obj-id 5
   ipjax estimate mug.ipjax --frames scene/ -o poses.json --overlay pictures/
   ipjax estimate mug.ipjax --frames scene/ --config fast --set match.views=4 --json | jq .frames[].objects
 
+A mask is an image of any kind, or a file of detections: JSON of BOP, COCO, SAM or Grounded-SAM, npz of CNOS or SAM-6D,
+a stack of masks as npy, an image of labels. Of several masks without a class each is tried, and the one of highest
+confidence kept: one estimate for each, of the 16 first by score, or by size (--candidates). --obj-id picks a class,
+--instance one mask by its number in the file.
+
 A folder of frames holds rgb/ and depth/ with one file of the same name per frame, mask/ (or masks/, mask_visib/) with
-NAME.png for one object or NAME_000000.png, NAME_000001.png … for several, and a camera file: scene_camera.json (BOP),
-camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine numbers). In a scene of BOP, scene_gt.json
-says which of the masks is of which object: obj_000005.ipjax is its object 5, for other names --obj-id says it.
+NAME.png (or NAME.json, .npz, .npy) for one object or NAME_000000.png, NAME_000001.png … for several, and a camera file:
+scene_camera.json (BOP), camera.json, camera.yaml (ROS CameraInfo) or camera.txt (fx fy cx cy, or nine numbers). In a
+scene of BOP, scene_gt.json says which of the masks is of which object: obj_000005.ipjax is its object 5, for other
+names --obj-id says it.
 
 Depth of whole numbers needs a unit: --depth-scale 0.001 for millimetres, unless the camera file has BOP's depth_scale.
 The pose in the JSON maps the coordinates of your mesh file to camera metres; every frame and unit is named there.
@@ -48,21 +56,35 @@ def add(commands: Any) -> None:
     parser.add_argument("objects", metavar="OBJ.ipjax", type=Path, nargs="+", help="object files, from 'ipjax onboard'")
     parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image")
     options.add_depth(parser, "depth aligned to it: 16-bit PNG, TIFF or npy")
-    options.add_mask(parser, "the object's visible pixels", "instead of a mask, pixels", many=True)
+    options.add_mask(
+        parser,
+        "the object's visible pixels: an image, npy, or detections (JSON, npz)",
+        "instead of a mask, pixels",
+        many=True,
+    )
     parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
     parser.add_argument(
         "--instance",
         type=int,
         metavar="N",
         action="append",
-        help="with --frames: the mask NAME_00000N.png is the object's; one for each object",
+        help="the number of the object's mask in a file of several, from 0, or in the name of its image with --frames; "
+        "one for each object",
     )
     parser.add_argument(
         "--obj-id",
         type=int,
         metavar="N",
         action="append",
-        help="with --frames and a scene_gt.json: which object of it; one for each object (default: from its name)",
+        help="which object of the detections, or of scene_gt.json with --frames; one for each object (default: from "
+        "its name, obj_00000N)",
+    )
+    parser.add_argument(
+        "--candidates",
+        type=parse_count,
+        metavar="N",
+        default=MOST,
+        help=f"of several masks that may be the object's, try the N best, one estimate each (default {MOST})",
     )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--size", type=float, metavar="MM", help="the object's true diameter in millimetres, if known")
@@ -103,11 +125,12 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
 
     config = options.read_config(arguments)
     many = arguments.frames is not None
-    first = _read_first(frames[0], arguments) if not many else None
     objects = [load(path) for path in arguments.objects]
+    names = [info.name for _, info in objects]
+    first = _read_first(frames[0], arguments, names) if not many else None
     _check_objects(objects, arguments)
     if many:
-        choose_masks(frames, [info.name for _, info in objects], arguments)
+        choose_masks(frames, names, arguments)
     identities = [info.encoder for _, info in objects]
     encoder = load_matching_encoder(arguments.objects, identities, arguments.weights)
     messages.print_notes()
@@ -190,14 +213,17 @@ def _check_objects(objects: list[tuple[Any, Any]], arguments: argparse.Namespace
             raise ValueError(f"--mesh-out: {path} keeps no mesh")
 
 
-def _read_first(files: FrameFiles, arguments: argparse.Namespace) -> Images:
+def _read_first(files: FrameFiles, arguments: argparse.Namespace, names: list[str]) -> Images:
     """Read a single frame, so that bad images are refused before weights are loaded and anything is compiled."""
     from ipjax.inference.frames import frame
 
-    images = read_frame(files, arguments)
-    for mask, box in zip(images.masks, files.boxes, strict=True):
-        scale, crop = arguments.depth_scale, arguments.crop
-        frame(images.rgb, images.depth, mask, images.camera, box=box, depth_scale=scale, crop=crop)
+    images = read_frame(files, arguments, names)
+    for candidates, box in zip(images.candidates, files.boxes, strict=True):
+        given: dict[str, Any] = {"depth_scale": arguments.depth_scale, "crop": arguments.crop}
+        if candidates is None:
+            frame(images.rgb, images.depth, None, images.camera, box=box, **given)
+        else:
+            check_any(images, candidates, box, **given)
     return images
 
 
@@ -212,22 +238,39 @@ def _estimate_frame(
 
     warned = len(messages.warnings)
     if images is None:
-        images = read_frame(files, arguments)
+        images = read_frame(files, arguments, [info.name for _, info in estimator.objects])
     crops = []
-    for i, (mask, box) in enumerate(zip(images.masks, files.boxes, strict=True)):
+    for i, (candidates, box) in enumerate(zip(images.candidates, files.boxes, strict=True)):
+        # Several masks are cut out one after the other, as each is estimated.
+        if candidates is not None and len(candidates) > 1:
+            crops.append(None)
+            continue
+        mask = None if candidates is None else candidates[0].mask
         start = time.perf_counter()
         crop = estimator.frame(i, images.rgb, images.depth, mask, images.camera, box)
         crops.append((crop, time.perf_counter() - start))
     entries, results = [], []
-    for i, (crop, seconds) in enumerate(crops):
+    for i, cut in enumerate(crops):
         info = estimator.objects[i][1]
         # A reference photo with depth has measured the size; else it is free, unless the user knows it.
         given = arguments.diameter is not None or arguments.free_size
-        diameter = arguments.diameter if given else info.measured_diameter
-        result = estimator.run(i, *crop, seed=arguments.seed, diameter=diameter)
+        options: dict[str, Any] = {
+            "seed": arguments.seed,
+            "diameter": arguments.diameter if given else info.measured_diameter,
+        }
+        start, tried = time.perf_counter(), None
+        if cut is None:
+            masks = images.candidates[i]
+            messages.print_notes()
+            messages.note(f"{files.name}: {info.name}: {len(masks)} masks may be the object's: each is tried")
+            result, seconds, tried = estimate_best(estimator, i, images, masks, files.boxes[i], **options)
+        else:
+            crop, seconds = cut
+            result = estimator.run(i, *crop, **options)
         for line in result.warnings:
             messages.keep(line, is_warning=True)
         results.append(result)
+        diameter = options["diameter"]
         entries.append(
             {
                 "object_file": str(arguments.objects[i]),
@@ -239,6 +282,10 @@ def _estimate_frame(
                 },
             }
         )
+        if tried is not None:
+            entries[-1]["candidates"] = tried
+            entries[-1]["candidates_seconds"] = round(time.perf_counter() - start, 6)
+            messages.note(f"{files.name}: {info.name}: {_told(tried, entries[-1]['candidates_seconds'])}")
     entry: dict[str, Any] = {
         "frame": files.name,
         "rgb": str(files.rgb),
@@ -256,6 +303,14 @@ def _estimate_frame(
         for one, result, path in zip(entries, results, _mesh_paths(files.name, arguments), strict=True):
             one["mesh_written"] = _write_mesh(result, path, messages)
     return entry
+
+
+def _told(tried: list[dict[str, Any]], seconds: float) -> str:
+    """One sentence about the masks that were tried."""
+    used = [one for one in tried if one["confidence"] is not None]
+    best = next(one for one in tried if one["chosen"])
+    left = f", {len(tried) - len(used)} could not be used" if len(used) < len(tried) else ""
+    return f"mask {best['index']} has the highest confidence; {len(used)} tried in {seconds:.1f} s{left} (--instance)"
 
 
 def _draw(name: str, images: Images, results: list[Any], config: Any, arguments: argparse.Namespace) -> Path:

@@ -14,6 +14,7 @@ examples:
   ipjax evaluate ycbv/ -o results/default
   ipjax evaluate ycbv/ -o results/paper --config paper --against results/default/ipjax-default_ycbv-test.csv
   ipjax evaluate ycbv/ -o results/four_views --set match.views=4
+  ipjax evaluate ycbv/ -o results/cnos --detections cnos_ycbv-test.json      on other people's masks
   ipjax evaluate ycbv/ -o results/level2 --mesh-quality 2        on meshes made worse; see 'ipjax degrade'
   ipjax evaluate dexycb/ -o results/mustard --models ycbv/ --only 5 \\
       --mesh 5=instantmesh_mustard.obj --alignment 5=instantmesh_mustard_to_obj_000005.json
@@ -31,7 +32,7 @@ def add(commands: Any) -> None:
         commands,
         "evaluate",
         run,
-        "estimate every target of a BOP data set with its annotated masks, and score the result",
+        "estimate every target of a BOP data set with its annotated masks or detections, and score the result",
         EXAMPLES,
     )
     options.add_dataset(parser)
@@ -51,6 +52,12 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--alignment", action="append", metavar="N=JSON", help="its similarity to the model: scale, R, t; to score it"
     )
+    parser.add_argument(
+        "--detections",
+        type=Path,
+        metavar="FILE",
+        help="masks to use: BOP's JSON, npz of CNOS or SAM-6D, or a folder of such (default: the annotated ones)",
+    )
     parser.add_argument("--known-size", action="store_true", help="tell the method each object's true diameter")
     options.add_crop(parser)
     options.add_scoring(
@@ -69,7 +76,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     options.check_seed(arguments.seed)
     if arguments.against is not None and not arguments.against.is_file():
         raise ValueError(f"{arguments.against}: no such result file")
-    from ipjax.bop.dataset import Dataset, parse_images
+    from ipjax.bop.dataset import parse_images
+    from ipjax.bop.detections import read_detections
     from ipjax.bop.estimator import DatasetEstimator
     from ipjax.bop.evaluation import evaluate
     from ipjax.bop.objects import parse_numbered, prepare_objects
@@ -80,7 +88,10 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     config = options.read_config(arguments)
     meshes = parse_numbered(arguments.mesh, "--mesh")
     alignments = parse_numbered(arguments.alignment, "--alignment")
-    dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models)
+    dataset = options.open_dataset(arguments)
+    detections = None if arguments.detections is None else read_detections(arguments.detections)
+    if detections is not None and not any(one.segmentation is not None for one in detections):
+        raise ValueError(f"{arguments.detections}: its detections have boxes, but no masks")
     encoder = options.load_encoder(arguments)
     messages.print_notes()
     use_compilation_cache()
@@ -105,7 +116,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         estimator,
         arguments.output,
         method=_method(arguments),
-        settings=estimator.settings(),
+        settings=estimator.settings() | _describe(detections),
+        detections=detections,
         alignments=estimator.alignments,
         aligned_by=estimator.aligned_by,
         on_error="skip" if arguments.skip_bad else "raise",
@@ -122,10 +134,22 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     return 0
 
 
+def _describe(detections: list[Any] | None) -> dict[str, Any]:
+    """What a resumed run must agree in, of detections."""
+    if detections is None:
+        return {}
+    import hashlib
+
+    content = repr([(*vars(one).values(),) for one in detections])
+    return {"detections": hashlib.sha256(content.encode()).hexdigest()}
+
+
 def _method(arguments: argparse.Namespace) -> str:
     """What the results are called: all that was not the default, in words that a file name may have."""
     chosen = (Path(arguments.config).stem, *arguments.changes)
     parts = ["ipjax", *(re.sub(r"[^\w.]+", "-", words) for words in chosen)]
+    if arguments.detections is not None:
+        parts.append(re.sub(r"[^\w.]+", "-", arguments.detections.name.split(".")[0]))
     if arguments.mesh_quality:
         parts.append(f"level{arguments.mesh_quality}")
     if arguments.known_size:

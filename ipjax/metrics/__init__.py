@@ -19,9 +19,14 @@ if TYPE_CHECKING:
     from ipjax.metrics.poses import scale_error as scale_error
     from ipjax.metrics.poses import translation_error as translation_error
     from ipjax.metrics.poses import turn_angle as turn_angle
+    from ipjax.metrics.precision import OVERLAPS as OVERLAPS
     from ipjax.metrics.precision import average_precision as average_precision
+    from ipjax.metrics.precision import box_overlaps as box_overlaps
     from ipjax.metrics.precision import detection_precision as detection_precision
+    from ipjax.metrics.precision import mask_overlaps as mask_overlaps
+    from ipjax.metrics.precision import match_overlaps as match_overlaps
     from ipjax.metrics.precision import match_poses as match_poses
+    from ipjax.metrics.precision import overlap_precision as overlap_precision
     from ipjax.metrics.recalls import ADD_LIMIT as ADD_LIMIT
     from ipjax.metrics.recalls import PIXEL_THRESHOLDS as PIXEL_THRESHOLDS
     from ipjax.metrics.recalls import SIZE_TOLERANCES as SIZE_TOLERANCES
@@ -49,6 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ADD_LIMIT",
+    "OVERLAPS",
     "PIXEL_THRESHOLDS",
     "SIZE_TOLERANCES",
     "SYMMETRY_STEP",
@@ -59,13 +65,17 @@ __all__ = [
     "area_under_accuracy",
     "average_precision",
     "average_recall",
+    "box_overlaps",
     "closest_symmetry",
     "detection_precision",
     "discretise_symmetries",
     "distances_from_camera",
+    "mask_overlaps",
+    "match_overlaps",
     "match_poses",
     "mspd",
     "mssd",
+    "overlap_precision",
     "projection_distance",
     "projections_overlap",
     "recall",
@@ -90,9 +100,14 @@ _HOMES = {
         "turn_angle",
     ),
     "precision": (
+        "OVERLAPS",
         "average_precision",
+        "box_overlaps",
         "detection_precision",
+        "mask_overlaps",
+        "match_overlaps",
         "match_poses",
+        "overlap_precision",
     ),
     "recalls": (
         "ADD_LIMIT",

@@ -1,6 +1,7 @@
 """BOP data sets written from the golden numbers, for the tests of reading and scoring."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -102,6 +103,34 @@ def write_images(root: Path, scenes: int = 1, images: int = 4) -> Path:
         (folder / "scene_camera.json").write_text(json.dumps(camera))
         (folder / "scene_gt.json").write_text(json.dumps(truth))
     (root / "test_targets_bop19.json").write_text(json.dumps(targets))
+    return root
+
+
+def write_annotated(root: Path, golden: Mapping[str, np.ndarray]) -> Path:
+    """The instances of the golden detections as a data set of one scene, 5: masks of what is visible, boxes of the
+    whole silhouettes in scene_gt_info.json, and targets of 2024, which name no objects."""
+    from PIL import Image
+
+    write_models(root)
+    folder = make_scene(root, 5)
+    images = sorted({int(image) for name in ("gt_image", "det_image") for image in golden[name]})
+    truths: dict[str, list] = {str(image): [] for image in images}
+    infos: dict[str, list] = {str(image): [] for image in images}
+    masks = np.unpackbits(golden["gt_mask"], axis=-1)
+    for image, obj, visib, box, mask in zip(
+        *(golden[f"gt_{name}"] for name in ("image", "obj", "visib", "box")), masks, strict=True
+    ):
+        mine = truths[str(image)]
+        Image.fromarray(mask * np.uint8(255)).save(folder / "mask_visib" / f"{image:06d}_{len(mine):06d}.png")
+        mine.append({"obj_id": int(obj), "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0, 0, 700]})
+        infos[str(image)].append({"visib_fract": float(visib), "bbox_obj": box.tolist()})
+    camera = {"cam_K": [100.0, 0, 32, 0, 100.0, 24, 0, 0, 1], "depth_scale": 0.5}
+    (folder / "scene_gt.json").write_text(json.dumps(truths))
+    (folder / "scene_gt_info.json").write_text(json.dumps(infos))
+    (folder / "scene_camera.json").write_text(json.dumps(dict.fromkeys(truths, camera)))
+    (root / "camera.json").write_text(json.dumps({"width": 64, "height": 48}))
+    targets = [{"scene_id": 5, "im_id": image} for image in images]
+    (root / "test_targets_bop24.json").write_text(json.dumps(targets))
     return root
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from ipjax.cameras import point_map
 from ipjax.estimation.features import describe
+from ipjax.files.images.run_lengths import encode_rle
 from ipjax.files.objects.saving import save
 from ipjax.records import Camera, Patches, Similarity, Surface, Templates, View
 
@@ -247,6 +248,83 @@ def test_a_machine_gets_one_document_and_a_person_one_line(found_case, capfd):
     assert run([*map(str, words)]) == 0
     out, error = capfd.readouterr()
     assert out.count("\n") == 1 and "000001: mug: centre" in out and "no such file" in error
+
+
+def write_detections(path, *masks, **more):
+    """Masks as BOP's detections of image 1, the first the surest; none has a class unless ``category_id`` says it."""
+    entries = [{"score": 1 / (1 + i), "segmentation": encode_rle(mask)} | more for i, mask in enumerate(masks)]
+    path.write_text(json.dumps([entry | {"scene_id": 0, "image_id": 1} for entry in entries]))
+    return path
+
+
+def test_of_several_masks_without_a_class_each_is_tried(found_case, capfd):
+    folder, _, translation = found_case
+    whole = relief()[2]
+    corner, empty = whole.copy(), whole & False
+    corner[:, 60:] = corner[60:] = False
+    scene = folder / "scene"
+    words = ["estimate", folder / "relief.ipjax", "--rgb", scene / "rgb" / "000001.png", "--config", "fast"]
+    words += ["--depth", scene / "depth" / "000001.png", "--camera", scene / "scene_camera.json", "--json"]
+
+    def told(file, *more):
+        status = run([*map(str, words), "--mask", str(file), *map(str, more)])
+        out, error = capfd.readouterr()
+        return (json.loads(out)["frames"][0]["objects"][0] if out else status), error
+
+    def place(one):
+        return one["camera_from_object"]["translation_m"]
+
+    masks = write_detections(folder / "detections.json", corner, empty, whole)
+    one, error = told(masks)
+    np.testing.assert_allclose(place(one), translation, atol=0.015)
+    tried = {entry["index"]: entry for entry in one["candidates"]}
+    assert tried[2]["chosen"] and not tried[0]["chosen"] and tried[2]["confidence"] > tried[0]["confidence"]
+    assert one["confidence"] == tried[2]["confidence"]
+    assert tried[1]["rejected"] == "the mask is empty" and tried[1]["confidence"] is None
+    assert "3 masks may be the object's" in error and "mask 2 has the highest confidence; 2 tried" in error
+    assert "1 could not be used" in error
+    # The same answer as from that mask alone, which nothing else is said of.
+    alone, error = told(masks, "--instance", 2)
+    assert place(alone) == place(one) and "candidates" not in alone and "tried" not in error
+    # A bound, by their own score, and said; then only the wrong one is left.
+    bound, error = told(masks, "--candidates", 1)
+    assert bound["confidence"] == tried[0]["confidence"]
+    assert "of 3 masks the 1 first by score are tried, one estimate each" in error
+    # An image of labels, where the object is the second; and its name or --obj-id chooses among classes.
+    labels = folder / "labels.png"
+    Image.fromarray((corner * 1 + (whole & ~corner) * 2).astype(np.uint8)).save(labels)
+    numbered, _ = told(labels)
+    assert {e["index"]: e["source"].rpartition(" ")[2] for e in numbered["candidates"]} == {0: "1", 1: "2"}
+    assert [e["index"] for e in numbered["candidates"] if e["chosen"]] == [1]
+    classes = write_detections(folder / "classes.json", whole, category_id=4)
+    entries = json.loads(classes.read_text())
+    classes.write_text(json.dumps([entries[0] | {"category_id": 9, "segmentation": encode_rle(corner)}, *entries]))
+    assert place(told(classes, "--obj-id", 4)[0]) == place(alone)
+    assert told(classes)[0] == 2
+    assert "the objects 4, 9: say with --obj-id which is mug" in told(classes)[1]
+    assert "no detection of object 3; it has those of 4, 9" in told(classes, "--obj-id", 3)[1]
+    assert "no mask 5 of this image; there are 0, 1, 2" in told(masks, "--instance", 5)[1]
+    small = write_detections(folder / "small.json", corner[:90])
+    assert "entry 0: its mask is 224 × 90, but the image 224 × 224" in told(small)[1]
+    nothing = write_detections(folder / "nothing.json", empty, empty)
+    assert "none of 2 masks can be used" in told(nothing)[1]
+
+
+def test_a_folder_of_frames_may_have_detections_as_masks(found_case, capfd):
+    folder, _, translation = found_case
+    scene = folder / "scene"
+    (scene / "scene_gt.json").unlink()
+    for path in (scene / "mask").iterdir():
+        path.unlink()
+    mask = relief()[2]
+    np.savez(scene / "mask" / "000001.npz", segmentation=np.stack([~mask, mask]), category_id=[7, 4], score=[0.5, 0.25])
+    words = ["estimate", folder / "obj_000004.ipjax", "--frames", scene, "--config", "fast", "--json"]
+    run([*map(str, words)])
+    out, _ = capfd.readouterr()
+    good, bad = json.loads(out)["frames"]
+    (one,) = good["objects"]
+    assert one["mask"].endswith("000001.npz") and "no such file" in bad["error"]
+    np.testing.assert_allclose(one["camera_from_object"]["translation_m"], translation, atol=0.015)
 
 
 def test_a_scene_of_bop_asks_which_mask_is_whose(case, capfd):

@@ -14,6 +14,9 @@ import pytest
 from builders.bop_roots import write_ellipsoids
 
 from ipjax import cli
+from ipjax.bop.dataset import Dataset
+from ipjax.bop.detections import as_detection, write_detections
+from ipjax.bop.results import read_results
 from ipjax.commands import evaluate as evaluate_command
 
 HERE = Path(__file__).resolve().parents[1]
@@ -75,6 +78,32 @@ def test_results_are_named_in_words_that_a_file_name_may_have():
 def whole(place) -> str:
     """An uninterrupted run."""
     return finish(evaluate(place, "whole", "--without", "1/0"))
+
+
+def test_detections_take_the_place_of_annotated_masks(place, whole, capsys):
+    """The annotated masks as somebody's detections: the same poses, and the detector's time is added."""
+    data = Dataset(place / "balls")
+    found = []
+    for scene, image in data.target_images:
+        for target in data.given_targets(scene, image):
+            assert target.mask is not None
+            worse = target.mask & (np.arange(target.mask.shape[1]) > target.mask.shape[1] // 2)
+            for mask, score in ((worse, 0.4), (target.mask, 0.5)):
+                found.append(as_detection(scene, image, target.obj_id, score, mask, 100.0))
+    path = write_detections(place / "mine_balls-test.json", found)
+    finish(evaluate(place, "detected", "--detections", path))
+    assert results(place / "detected")[0] == results(place / "whole")[0]
+    rows = read_results(next((place / "detected").glob("*-mine-balls-test_balls-test.csv")))
+    assert rows and all(row.time > 100 for row in rows)
+    # Of 2024's targets nobody says how many there are, so that every detection is estimated.
+    asked = [{"scene_id": s, "im_id": i} for s, i in data.target_images]
+    (place / "balls" / "asked.json").write_text(json.dumps(asked))
+    finish(evaluate(place, "asked", "--detections", path, "--targets", "asked.json", "--metrics", "ap"))
+    rows = read_results(next((place / "asked").glob("*-test.csv")))
+    assert len(rows) == len(found) and len({(r.scene_id, r.im_id) for r in rows}) == len(asked)
+    path.write_text(json.dumps([json.loads(path.read_text())[0] | {"segmentation": {}}]))
+    words = ["evaluate", str(place / "balls"), "-o", str(place / "none"), "--detections", str(path)]
+    assert cli.main(words) == 2 and "boxes, but no masks" in capsys.readouterr().err
 
 
 def test_the_tables_are_printed(place, whole):

@@ -62,7 +62,7 @@ class Score:
     medians: dict[str, float]  # rotation_deg, translation_mm, scale_percent over the instances that got an estimate
     missing: int  # instances without an estimate
     add: dict[str, float]  # add_auc, add_s_auc, add_or_s_auc, recall_01d, add_s_01d; empty unless asked for
-    precision: dict[str, float]  # ap_mssd, ap_mspd, map; empty unless asked for
+    precision: dict[str, float]  # ap_mssd, ap_mspd, map, ap_mssd_mm; empty unless asked for
     seconds_per_image: float | None
     notes: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()

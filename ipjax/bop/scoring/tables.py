@@ -64,7 +64,8 @@ def format_score(found: Score) -> str:
         p = found.precision
         lines.append(
             f"BOP 2024 detection: AP_MSSD {100 * p['ap_mssd']:.1f}, AP_MSPD {100 * p['ap_mspd']:.1f}, "
-            f"mAP {100 * p['map']:.1f}."
+            f"mAP {100 * p['map']:.1f}; BOP 2025: AP_MSSD {100 * p['ap_mssd']:.1f}, to 2 … 20 mm "
+            f"{100 * p['ap_mssd_mm']:.1f}."
         )
     if found.seconds_per_image is not None:
         lines.append(f"Time per image: {found.seconds_per_image:.2f} s.")

@@ -12,6 +12,7 @@ from ipjax.commands.interface.parser import parse_camera
 
 COLOURS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 DEPTHS = (".png", ".tif", ".tiff", ".npy")
+MASKS = (".png", ".npy", ".npz", ".json")
 CAMERAS = ("scene_camera.json", "camera.json", "camera.yaml", "camera.yml", "camera.txt", "cam_K.txt")
 
 
@@ -35,7 +36,7 @@ class Images:
     rgb: Any  # h × w × 3
     depth: Any  # h × w, in the file's unit
     camera: Any
-    masks: list[Any]  # of each object, h × w or None
+    candidates: list[Any]  # of each object the masks that may be its, best first (`interface.candidates`); or None
     seconds: float
 
 
@@ -115,14 +116,16 @@ def choose_masks(frames: list[FrameFiles], names: list[str], arguments: argparse
     scene = read_json(truth) if truth.is_file() and not arguments.instance else None
     shares = read_json(about) if about.is_file() else {}
     ids = arguments.obj_id
-    if scene is None and ids:
-        raise ValueError(f"{folder}: --obj-id needs a scene_gt.json, and no --instance")
     for frame in frames:
-        plain = masks / f"{frame.name}.png"
+        plain = next((p for p in (masks / f"{frame.name}{end}" for end in MASKS) if p.is_file()), None)
         numbered = sorted(p for p in masks.glob(f"{frame.name}_*.png") if p.stem[len(frame.name) + 1 :].isdigit())
-        if arguments.instance:
+        if plain is not None and plain.suffix != ".png":
+            frame.masks = [plain] * count  # detections say of which object they are, or are tried
+        elif scene is None and ids:
+            raise ValueError(f"{folder}: --obj-id needs a scene_gt.json, or detections as masks, and no --instance")
+        elif arguments.instance:
             frame.masks = [masks / f"{frame.name}_{number:06d}.png" for number in arguments.instance]
-        elif plain.is_file() and (count == 1 or arguments.mask_label):
+        elif plain is not None and (count == 1 or arguments.mask_label):
             frame.masks = [plain] * count
         elif scene is not None and numbered:
             if ids is None:
@@ -139,7 +142,7 @@ def choose_masks(frames: list[FrameFiles], names: list[str], arguments: argparse
             )
         else:
             expected = [masks / f"{frame.name}_{i:06d}.png" for i in range(count)]
-            frame.masks = [*expected] if count > 1 or expected[0].is_file() else [plain]
+            frame.masks = [*expected] if count > 1 or expected[0].is_file() else [masks / f"{frame.name}.png"]
 
 
 def _object_ids(names: list[str], scene: Any, path: Path) -> list[int]:
@@ -185,21 +188,37 @@ def _choose_instance(scene: Any, shares: Any, stem: str, number: int, path: Path
     return best
 
 
-def read_frame(files: FrameFiles, arguments: argparse.Namespace) -> Images:
-    """Read the files of one frame; ValueError or OSError, in words, for what cannot be used."""
+def read_frame(files: FrameFiles, arguments: argparse.Namespace, names: list[str]) -> Images:
+    """Read the files of one frame; ValueError or OSError, in words, for what cannot be used.
+
+    ``names`` are those of the objects.
+    """
+    from ipjax.commands.interface.candidates import Choice, read_masks
     from ipjax.files.cameras.reading import read_camera
     from ipjax.files.images.depth import read_depth
-    from ipjax.files.images.masks import read_mask
     from ipjax.files.images.opening import read_rgb
 
     if files.error:
         raise ValueError(files.error)
     start = time.perf_counter()
-    labels = arguments.mask_label or [None] * len(files.masks)
     image = arguments.image
     if image is None and files.name.isdigit():
         image = int(files.name)
     rgb, depth = read_rgb(files.rgb), read_depth(files.depth)
     camera = read_camera(parse_camera(files.camera), image)
-    masks = [None if path is None else read_mask(path, label) for path, label in zip(files.masks, labels, strict=True)]
-    return Images(rgb, depth, camera, masks, round(time.perf_counter() - start, 6))
+    scene = files.rgb.absolute().parent.parent.name  # a number where the folders are BOP's
+    candidates: list[Any] = []
+    for i, (path, name) in enumerate(zip(files.masks, names, strict=True)):
+        if path is None:
+            candidates.append(None)
+            continue
+        label, category, instance = (
+            None if given is None else given[i]
+            for given in (arguments.mask_label, arguments.obj_id, arguments.instance)
+        )
+        # In a folder of images a number names one of them, or is looked up in scene_gt.json.
+        if arguments.frames is not None and path.suffix == ".png":
+            category = instance = None
+        choice = Choice(name, label, category, instance, arguments.candidates)
+        candidates.append(read_masks(path, choice, rgb.shape[:2], image, int(scene) if scene.isdigit() else None))
+    return Images(rgb, depth, camera, candidates, round(time.perf_counter() - start, 6))

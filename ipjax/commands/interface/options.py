@@ -179,9 +179,22 @@ def add_dataset(parser: Any) -> None:
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="in BOP layout")
     parser.add_argument("--split", default="test", help="which split (default test)")
     parser.add_argument("--models", type=Path, metavar="FOLDER", help="another data set, to take the models from")
+    parser.add_argument(
+        "--targets", metavar="NAME", help="the file of targets in it (default: test_targets_bop19.json, or bop24)"
+    )
 
 
-def add_scoring(parser: Any, default: tuple[str, ...], default_text: str, skip_text: str) -> None:
+def open_dataset(arguments: argparse.Namespace) -> Any:
+    """The data set that the options of `add_dataset` name; ValueError, in words, where it is not there."""
+    from ipjax.bop.dataset import Dataset
+
+    dataset = Dataset(arguments.dataset, arguments.split, models=arguments.models, targets=arguments.targets)
+    if arguments.targets is not None and not dataset.targets_file.is_file():
+        raise ValueError(f"{dataset.targets_file}: no such file of targets")
+    return dataset
+
+
+def add_scoring(parser: Any, default: tuple[str, ...] | None, default_text: str, skip_text: str) -> None:
     """What is measured, what it is compared with, and what is left out; the texts are for ``--help``."""
     parser.add_argument(
         "--metrics",

@@ -103,8 +103,11 @@ def _is_matrix(rows: list[Any]) -> bool:
     )
 
 
-def read_annotations(path: str | Path) -> list[Annotation]:
+def read_annotations(path: str | Path, *, problems: list[str] | None = None) -> list[Annotation]:
     """The detections of a JSON or npz file, in its order; the module says of which kinds.
+
+    Args:
+        problems: gets a sentence for each entry that is damaged, which is then left out.
 
     Raises:
         ValueError: missing, unreadable, of none of these kinds, or with entries that are damaged; names file and entry.
@@ -136,28 +139,32 @@ def read_annotations(path: str | Path) -> list[Annotation]:
     found = []
     for number, entry in enumerate(content):
         where = f"{path}, entry {number}"
-        if isinstance(entry, dict) and set(entry) >= {"size", "counts"}:
-            entry = {"segmentation": entry}  # a mask alone
-        if not isinstance(entry, dict):
-            raise ValueError(f"{where}: a detection must be a dictionary")
         try:
-            image_id = _read_integer(entry, "image_id")
-            size = _read_size(entry, "height", "width") or images.get(-1 if image_id is None else image_id) or whole
-            annotation = Annotation(
-                _read_integer(entry, "scene_id"),
-                image_id,
-                _read_integer(entry, "category_id"),
-                next((score for name in _SCORES if (score := _read_number(entry, name)) is not None), None),
-                _read_box(entry.get("bbox"), corners),
-                -1.0 if (time := _read_number(entry, "time")) is None else time,
-                entry.get("segmentation") or None,  # BOP's toolkit writes {} where there is none
-                size,
-                where,
-            )
+            found.append(_read_entry(entry, where, images, whole, corners))
         except ValueError as error:
-            raise ValueError(f"{where}: {error}") from None
-        found.append(annotation)
+            if problems is None:
+                raise ValueError(f"{where}: {error}") from None
+            problems.append(f"{where}: {error}")
     return found
+
+
+def _read_entry(entry: Any, where: str, images: dict[int, Size], whole: Size | None, corners: bool) -> Annotation:
+    if isinstance(entry, dict) and set(entry) >= {"size", "counts"}:
+        entry = {"segmentation": entry}  # a mask alone
+    if not isinstance(entry, dict):
+        raise ValueError("a detection must be a dictionary")
+    image_id, time = _read_integer(entry, "image_id"), _read_number(entry, "time")
+    return Annotation(
+        _read_integer(entry, "scene_id"),
+        image_id,
+        _read_integer(entry, "category_id"),
+        next((score for name in _SCORES if (score := _read_number(entry, name)) is not None), None),
+        _read_box(entry.get("bbox"), corners),
+        -1.0 if time is None else time,
+        entry.get("segmentation") or None,  # BOP's toolkit writes {} where there is none
+        _read_size(entry, "height", "width") or images.get(-1 if image_id is None else image_id) or whole,
+        where,
+    )
 
 
 def _read_npz(path: Path) -> list[Annotation]:

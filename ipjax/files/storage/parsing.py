@@ -1,11 +1,13 @@
 """JSON and YAML: no text can construct an object, recurse without end or take more memory than its budget."""
 
+import gzip
 import json
 import re
+import zlib
 from pathlib import Path
 from typing import Any
 
-from ipjax.files.storage.budget import check_budget
+from ipjax.files.storage.budget import budget, check_budget
 
 _MAX_YAML_FROM_BRACE = 2**20  # characters; PyYAML takes seconds for more
 _MAX_YAML_NODES = 50_000  # PyYAML keeps about a kilobyte for each of them while it reads
@@ -13,7 +15,7 @@ _MAX_DEPTH = 64  # levels of nesting; NumPy has no more axes either
 
 
 def read_text(path: str | Path, what: str = "file") -> str:
-    """The text of a UTF-8 file, with or without a byte order mark.
+    """The text of a UTF-8 file, with or without a byte order mark; unpacked where its name ends in .gz.
 
     Raises:
         ValueError: missing, unreadable, no text, or past the budget; names the file.
@@ -22,12 +24,24 @@ def read_text(path: str | Path, what: str = "file") -> str:
     if not path.is_file():
         raise ValueError(f"{path}: no such {what}")
     try:
+        if path.suffix.lower() == ".gz":
+            return _unpack(path).decode("utf-8-sig")
         check_budget(2 * path.stat().st_size, f"{path}: its text")
         return path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise ValueError(f"{path}: not a text file") from None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise ValueError(f"{path}: not a readable gzip file ({_first_line(error)})") from None
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _unpack(path: Path) -> bytes:
+    """What a gzip file holds; what unpacks to more than the budget is refused where it passes it."""
+    with gzip.open(path) as file:
+        data = file.read(budget() // 2 + 1)
+    check_budget(2 * len(data), f"{path}: its text")
+    return data
 
 
 def parse_json(text: str | bytes) -> Any:

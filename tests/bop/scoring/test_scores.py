@@ -74,7 +74,7 @@ def test_the_truth_scores_one_on_every_metric(small):
     names = ("mssd", "mspd", "vsd", "add", "add_s", "ap")
     found = score(true_rows(small), small, names, scales=[1.0] * 8)
     assert found.all_frames.recalls == {"mssd": 1.0, "mspd": 1.0, "vsd": 1.0, "ar": 1.0}
-    assert found.precision == {"ap_mssd": 1.0, "ap_mspd": 1.0, "map": 1.0}
+    assert found.precision == {"ap_mssd": 1.0, "ap_mspd": 1.0, "ap_mssd_mm": 1.0, "map": 1.0}
     assert set(found.add.values()) == {1.0}
     assert set(found.medians) == {"rotation_deg", "translation_mm", "scale_percent"}
     assert max(found.medians.values()) < 1e-6
