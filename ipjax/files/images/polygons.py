@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ipjax.files.images.opening import BYTES_PER_PIXEL
 from ipjax.files.storage.budget import check_budget
 
-_BYTES_PER_CROSSING = 64  # of the arrays that are made for each column that an edge crosses
+_BYTES_PER_PIXEL = 24  # of the mask and of what is counted for each pixel
+_BYTES_PER_CROSSING = 128  # of the arrays that are made for each column that an edge crosses
 
 
 def fill_polygons(polygons: Sequence[Any], size: tuple[int, int]) -> np.ndarray:
@@ -27,10 +27,16 @@ def fill_polygons(polygons: Sequence[Any], size: tuple[int, int]) -> np.ndarray:
         ValueError: a polygon of fewer corners, of half a corner, or of what is no number; too many for memory.
     """
     height, width = size
-    check_budget(BYTES_PER_PIXEL * max(height, 0) * max(width, 0), f"a mask of {width} × {height} pixels")
+    check_budget(_BYTES_PER_PIXEL * max(height, 0) * max(width, 0), f"a mask of {width} × {height} pixels")
     mask = np.zeros((height, width), bool)
     for polygon in polygons:
-        mask |= _fill(_read_corners(polygon), height, width)
+        corners = np.clip(_read_corners(polygon), -1e6, 1e6)
+        # Only the box around it is gone through: a file may have thousands of small ones.
+        (left, top), (right, bottom) = np.floor(corners.min(0)), np.ceil(corners.max(0))
+        left, right = (int(np.clip(x, 0, width)) for x in (left, right))
+        top, bottom = (int(np.clip(y, 0, height)) for y in (top, bottom))
+        if left < right and top < bottom:
+            mask[top:bottom, left:right] |= _fill(corners - [left, top], bottom - top, right - left)
     return mask
 
 
@@ -46,7 +52,6 @@ def _read_corners(polygon: Any) -> np.ndarray:
 
 def _fill(corners: np.ndarray, height: int, width: int) -> np.ndarray:
     """Each edge toggles, in every column whose middle it crosses, all pixels whose centre is below it."""
-    corners = np.clip(corners, -1e6, 1e6)
     start, end = corners, np.roll(corners, -1, axis=0)
     first = np.clip(np.ceil(np.minimum(start[:, 0], end[:, 0]) - 0.5), 0, width).astype(np.int64)
     last = np.clip(np.ceil(np.maximum(start[:, 0], end[:, 0]) - 0.5), 0, width).astype(np.int64)

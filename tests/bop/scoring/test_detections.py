@@ -176,7 +176,7 @@ def test_targets_of_2024_name_no_objects(tmp_path):
     assert not asked.names_objects and asked.target_images == listed.target_images
     assert score(protocol_rows(), asked, ("ap",), samples=0).precision == expected
     for row, says in (
-        ({"scene_id": 1}, "entry 0: scene_id and im_id"),
+        ({"scene_id": 1}, "entry 0: scene_id, im_id and obj_id"),
         ({"scene_id": 1, "im_id": 2, "inst_count": 1}, "obj_id"),
     ):
         (root / "test_targets_bop24.json").write_text(json.dumps([row]))

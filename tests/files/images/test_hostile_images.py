@@ -8,6 +8,7 @@ import itertools
 import json
 import struct
 import sys
+import zipfile
 import zlib
 
 import numpy as np
@@ -22,6 +23,7 @@ from ipjax.bop import alignments, dataset, detections
 from ipjax.files.images import run_lengths
 from ipjax.files.cameras.reading import read_camera
 from ipjax.onboarding.foreground import read_photo
+from ipjax.files.images.candidates import read_candidates
 from ipjax.files.images.depth import read_depth
 from ipjax.files.images.masks import read_mask
 from ipjax.files.images.opening import read_rgb, read_size
@@ -37,8 +39,8 @@ def read_truths(path):
     return dataset.Dataset(scene.parent.parent).truths(1, 0)
 
 readers = dict(rgb=read_rgb, depth=read_depth, mask=read_mask, camera=read_camera, photo=read_photo, rle=read_rle,
-               detections=detections.read_detections, settings=read_config, alignment=alignments.read_alignment,
-               truths=read_truths, size=read_size)
+               candidates=read_candidates, detections=detections.read_detections, settings=read_config,
+               alignment=alignments.read_alignment, truths=read_truths, size=read_size)
 told = {}
 for path in sorted(Path(sys.argv[1]).iterdir()):
     if not path.is_file():
@@ -121,6 +123,21 @@ def zipped() -> bytes:
     return buffer.getvalue()
 
 
+def bomb_of_masks() -> bytes:
+    """A zip file of some hundred kilobytes that unpacks to 400 MB of masks."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("masks.npy", "w") as file:
+        file.write(npy("{'descr': '|u1', 'fortran_order': False, 'shape': (400, 1024, 1024)}"))
+        for _ in range(400):
+            file.write(bytes(2**20))
+    return buffer.getvalue()
+
+
+def polygon_of(corners: int) -> bytes:
+    """Edges that all go from one side of a wide image to the other."""
+    return json.dumps([{"segmentation": [[0, 0, 4000, 9] * (corners // 2)], "height": 10, "width": 4000}]).encode()
+
+
 def photograph(size: int = 400) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(np.random.default_rng(0).integers(0, 256, (size, size, 3), dtype=np.uint8)).save(buffer, "PNG")
@@ -170,6 +187,15 @@ FILES = {  # what reads it is the first part of the name; words of the sentence
     "camera-object.yaml": (b"!!python/object/apply:os.getcwd []", "could not determine a constructor"),
     "camera-binary.yaml": (bytes(range(256)) * 10, "not a text file"),
     "detections-nested.json": (b"[" * 200_000, "nested too deeply"),
+    "candidates-nested.json": (b"[" * 200_000, "nested too deeply"),
+    "candidates-object.npy": (pickled(), "Python objects"),
+    "candidates-promise.npz": (bomb_of_masks(), "would take"),
+    "candidates-zip.npz": (zipped(), "it has no masks"),
+    "candidates-edges.json": (polygon_of(300_000), "would take"),
+    "candidates-endless.json": (
+        json.dumps([{"size": [9, 9], "counts": "o" * 5_000_000}]).encode(),
+        "no image has pixels for",
+    ),
     "settings-nested.json": (b"[" * 200_000, "nested too deeply"),
     "alignment-nested.json": (b"[" * 200_000, "nested too deeply"),
     "truths-nested.json": (b'{"0":' * 200_000, "nested too deeply"),
