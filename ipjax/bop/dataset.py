@@ -224,8 +224,8 @@ class Dataset:
                 kept = {name: int(row[name]) for name in names if name in row or name in needed}
             except (KeyError, TypeError, ValueError):
                 raise DatasetError(
-                    f"{self.targets_file}, entry {number}: scene_id, im_id and obj_id (of targets of 2024: the first two) "
-                    "must be there and be integers"
+                    f"{self.targets_file}, entry {number}: scene_id, im_id and obj_id (in 2024 the first two) must "
+                    "be there and be integers"
                 ) from None
             found.append(kept)
         return found
