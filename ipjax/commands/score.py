@@ -86,7 +86,7 @@ def _score_detections(dataset: Any, arguments: argparse.Namespace, messages: Mes
     for name in ("metrics", "against", "sizes", "without"):
         if getattr(arguments, name):
             raise ValueError(f"--{name} belongs to poses; {arguments.results} has detections")
-    from ipjax.bop.scoring.detections import format_detections, score_detections
+    from ipjax.bop.scoring.overlaps import format_detections, score_detections
 
     found = score_detections(
         arguments.results,

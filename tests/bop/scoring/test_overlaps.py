@@ -20,8 +20,9 @@ from ipjax.bop.detections import (
 )
 from ipjax.bop.records import DatasetError
 from ipjax.bop.results import write_results
-from ipjax.bop.scoring.detections import score_detections
+from ipjax.bop.scoring.overlaps import score_detections
 from ipjax.bop.scoring.scores import score
+from ipjax.files.images.run_lengths import decode_rle
 
 GOLDEN = np.load(Path(__file__).resolve().parents[2] / "golden" / "coco_detections.npz")
 
@@ -94,7 +95,7 @@ def test_files_come_back_as_they_were_written(dataset, tmp_path, capsys):
             score=[one.score for one in mine],
             bbox=np.array([one.box for one in mine]),
             time=0.25,
-            segmentation=np.stack([one.mask for one in mine]),
+            segmentation=np.stack([decode_rle(one.segmentation) for one in mine]),
         )
     expected = score_detections(path, dataset)
     assert score_detections(folder, dataset).kinds == expected.kinds == score_detections(packed, dataset).kinds
