@@ -357,8 +357,10 @@ class Dataset:
             return None
         entry, where = self._entry(scene_id, im_id, "scene_gt_info", list)
         try:
-            boxes = lambda item: (tuple(item[n]) if n in item else None for n in ("bbox_visib", "bbox_obj"))
-            return [(float(item.get("visib_fract", -1.0)), *boxes(item)) for item in entry]
+            box = lambda item, name: tuple(item[name]) if name in item else None
+            return [
+                (float(item.get("visib_fract", -1.0)), box(item, "bbox_visib"), box(item, "bbox_obj")) for item in entry
+            ]
         except (TypeError, ValueError, AttributeError):
             raise DatasetError(f"{where}: visib_fract must be a number") from None
 

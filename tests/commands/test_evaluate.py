@@ -88,7 +88,7 @@ def test_detections_take_the_place_of_annotated_masks(place, whole, capsys):
         for target in data.given_targets(scene, image):
             assert target.mask is not None
             worse = target.mask & (np.arange(target.mask.shape[1]) > target.mask.shape[1] // 2)
-            for mask, score in ((worse, 0.4), (target.mask, 0.5)):
+            for mask, score in ((worse, 0.4), (target.mask, 1.0)):
                 found.append(as_detection(scene, image, target.obj_id, score, mask, 100.0))
     path = write_detections(place / "mine_balls-test.json", found)
     finish(evaluate(place, "detected", "--detections", path))

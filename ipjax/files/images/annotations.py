@@ -258,11 +258,11 @@ def _read_box(value: Any, corners: bool) -> Box | None:
         return None
     if not isinstance(value, list) or len(value) != 4:
         raise ValueError(f"bbox must be x, y, width, height, not {value!r:.60}")
-    x, y, *rest = (_read_number({"bbox": number}, "bbox") for number in value)
-    if x is None or y is None or None in rest:
-        raise ValueError(f"bbox must be x, y, width, height, not {value!r:.60}")
-    width, height = (rest[0] - x, rest[1] - y) if corners else rest
-    if width < 0 or height < 0:
+    numbers = [_read_number({"bbox": number}, "bbox") for number in value]
+    x, y, width, height = (math.nan if number is None else number for number in numbers)
+    if corners:
+        width, height = width - x, height - y
+    if None in numbers or width < 0 or height < 0:
         raise ValueError(f"bbox must be x, y, width, height, none of the last two negative, not {value!r:.60}")
     return x, y, width, height
 

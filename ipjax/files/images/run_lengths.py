@@ -31,7 +31,7 @@ def decode_rle(segmentation: dict) -> np.ndarray:
         counts = _decompress(counts)
     # A list in the list would make NumPy speak of its own affairs.
     whole = isinstance(counts, list | tuple | np.ndarray) and not any(isinstance(run, list | dict) for run in counts)
-    runs = np.asarray(counts) if whole else np.zeros((1, 1))
+    runs: np.ndarray = np.asarray(counts) if whole else np.zeros((1, 1))
     if runs.ndim != 1 or (runs.size and runs.dtype.kind not in "ui") or (runs < 0).any():
         raise ValueError("the counts of a run-length mask must be whole numbers, not negative")
     # A single run beyond the mask could make the sum overflow.
