@@ -102,7 +102,7 @@ class ResectConfig(eqx.Module):
     drawn: int = _static(12, least=1)  # hypotheses of all views that are drawn
     polished: int = _static(4, least=1)  # best of them that are refined on what their drawings match
     rounds: int = _static(2)  # of it
-    window: float = 3.0  # patches in which it is
+    window: float = 2.0  # patches in which it is
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn
     guess: float = 0.1  # standard deviation of the guessed distance from the front to the centre, in diameters
@@ -138,7 +138,7 @@ class Config(eqx.Module):
         return Config(
             match=MatchConfig(views=6),
             refine=RefineConfig(steps=8, settle=False),
-            resect=ResectConfig(drawn=6, polished=2, rounds=1),
+            resect=ResectConfig(beside=4, views=8, count=512, drawn=4, polished=1),
             score=ScoreConfig(alternates=0, drawn=3),
         )
 
