@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.photo_pairs import Group, judge, rigid, states, synthetic_groups, view_angle
+from benchmarks.pairs import Group, rigid, synthetic_groups, view_angle
+from benchmarks.photo_pairs import judge, states
 from ipjax.cameras import look_at, project
 from ipjax.files.storage.parsing import parse_json
 from ipjax.files.storage.writing import append_json, read_lines, write_text

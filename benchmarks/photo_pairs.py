@@ -1,6 +1,7 @@
 """Photo → object → pose: how well an object that one photo showed is found in another frame.
 
     python -m benchmarks.photo_pairs ycbv --data FOLDER [--limit N]
+    python -m benchmarks.photo_pairs across --data FOLDER --others FOLDER …
     python -m benchmarks.photo_pairs synthetic [--data FOLDER] [--pairs 200] [--limit N]
     python -m benchmarks.photo_pairs table RESULTS.jsonl … [--page benchmarks/results/photos.md]
 
@@ -30,158 +31,24 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.pairs import (
+    BINS,
+    PER_REFERENCE,
+    REPEATED,
+    Group,
+    Shot,
+    dataset_groups,
+    rigid,
+    synthetic_groups,
+    view_angle,
+)
 from ipjax.files.storage.parsing import parse_json
 from ipjax.files.storage.writing import append_json, read_lines, write_text
-from ipjax.transforms import Similarity, rotation_from_vector
+from ipjax.transforms import Similarity
 
 METHODS = ("rgb", "rgbd", "scan")
 DEGRADED = ("level1", "level2", "level3", "level4")  # the true mesh made worse, for objects made in code
-BINS = (0, 15, 30, 45, 60, 90, 120, 180.1)  # degrees between the directions from which the two frames see the object
-PER_REFERENCE = 10  # queries of each synthetic reference: onboarding takes most of the time
-ABSENT = 2  # of them in which the object is also sought where another one stands
 SCANS = 3  # of them, for objects made in code, that are also tried with the true mesh or a worse copy of it
-POINTS = 4000  # of the model that errors are measured on
-
-
-@dataclasses.dataclass
-class Shot:
-    """One RGB-D frame of the object, and the truth."""
-
-    name: str
-    rgb: np.ndarray
-    depth: np.ndarray  # metres
-    mask: np.ndarray
-    K: np.ndarray
-    camera_from_object: Similarity[np.ndarray]  # metres from metres
-    other: np.ndarray | None = None  # the mask of another object
-
-
-@dataclasses.dataclass
-class Group:
-    """A reference and the queries it is tried on; the object's points and symmetries are metres of its own frame."""
-
-    object: str
-    mesh: Any  # ipjax.files.meshes.mesh.Mesh; its present frame is the object's
-    metres_per_unit: float  # of that mesh
-    model: Any  # ipjax.bop.scoring.errors.Model
-    reference: Shot
-    queries: list[Shot]
-    synthetic: bool = True  # an object made in code: also tried with the true mesh and with degraded copies
-
-
-def rigid(rotation: np.ndarray, translation: np.ndarray) -> Similarity[np.ndarray]:
-    """A motion that keeps the size."""
-    return Similarity(np.asarray(rotation, np.float64), np.asarray(translation, np.float64), np.ones(()))
-
-
-def view_angle(first: Shot, second: Shot) -> float:
-    """Degrees between the directions from the object's origin to the two cameras; roll is no part of it."""
-    eyes = [shot.camera_from_object.inverse().translation for shot in (first, second)]
-    cosine = eyes[0] @ eyes[1] / np.linalg.norm(eyes[0]) / np.linalg.norm(eyes[1])
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-
-
-# --- the pairs --------------------------------------------------------------------------------------------------------
-
-
-def ycbv_groups(folder: Path, objects: tuple[int, ...] = (2, 3, 4, 5, 8, 10, 15)) -> Iterator[Group]:
-    """Every frame of an object as the reference of all its frames in other scenes."""
-    from ipjax.bop.dataset import Dataset
-    from ipjax.bop.scoring.errors import Model
-
-    dataset = Dataset(folder)
-    frames: dict[int, list[tuple[int, int, Any]]] = {number: [] for number in objects}
-    for scene in dataset.scenes():
-        for image in dataset.images(scene):
-            for truth in dataset.truths(scene, image):
-                if truth.obj_id in frames and truth.visible >= 0.1:
-                    frames[truth.obj_id].append((scene, image, truth))
-
-    def shoot(scene, image, truth) -> Shot:
-        frame = dataset.frame(scene, image)
-        mask = dataset.mask(scene, image, truth.index)
-        name = f"{scene:06d}/{image:06d}"
-        return Shot(name, frame.rgb, frame.depth, mask, frame.camera, rigid(truth.rotation, truth.translation))
-
-    # Interleaved over objects, so that a run cut short has seen several.
-    turns = [(k, number) for number in objects for k in range(len(frames[number]))]
-    for k, number in sorted(turns):
-        scene, image, truth = frames[number][k]
-        others = [item for item in frames[number] if item[0] != scene]
-        if others:
-            mesh = dataset.mesh(number, "models")
-            queries = [shoot(*item) for item in others]
-            model = Model.load(dataset, number)
-            yield Group(f"obj_{number:06d}", mesh, 1.0, model, shoot(scene, image, truth), queries)
-
-
-def synthetic_groups(pairs: int, data: Path | None, seed: int = 0, each: int = PER_REFERENCE) -> Iterator[Group]:
-    """Rendered references (the object alone, lit, on grey) of objects on cluttered tables.
-
-    The reference sees the object from an angle drawn evenly from each bin in turn, rolled by up to 20°; both frames
-    have the noise of a cheap sensor. Objects are those made in code and, where ``data`` is, the scans there.
-    """
-    from ipjax.bop.dataset import Dataset
-    from ipjax.bop.scoring.errors import Model
-    from ipjax.files.meshes.mesh import normalise
-    from ipjax.rendering.render import render_scene
-    from ipjax.synthetic.objects import KINDS, make_object
-    from ipjax.synthetic.scenes import HEIGHT, WIDTH, make_scene
-    from ipjax.synthetic.sensor import Sensor, expose, sense_depth
-
-    scans = []
-    if data is not None:
-        dataset = Dataset(data)
-        scans = [(f"obj_{n:06d}", normalise(dataset.mesh(n, "models"))) for n in sorted(dataset.models())]
-    none = Similarity(np.eye(3)[None], np.zeros((1, 3)), np.ones(1))
-    for turn in range(-(-pairs // each)):
-        rng = np.random.default_rng([seed, turn])
-        synthetic = not (scans and turn % 2)
-        if not synthetic:
-            name, mesh = scans[turn // 2 % len(scans)]
-        else:
-            kind = KINDS[turn // 2 % len(KINDS)] if scans else KINDS[turn % len(KINDS)]
-            name, mesh = f"{kind}-{turn}", make_object(kind, 100_000 * seed + 1000 + turn)
-        other = make_object(KINDS[(turn + 3) % len(KINDS)], 2000 + turn)
-        size, other_size = (float(x) for x in rng.uniform(0.09, 0.22, 2))
-        queries = []
-        for k in range(each):
-            number = 10_000 * seed + each * turn + k
-            scene = make_scene([mesh, other], seed=number, sizes=[size, other_size], clutter=2)
-            if scene.masks[0].sum() < 400:
-                continue
-            pose = scene.camera_from_object[0]
-            mask, other_mask = scene.masks
-            truth = rigid(pose.rotation, pose.translation)
-            shot = Shot(f"scene {k}", scene.rgb, scene.depth, mask, scene.matrix, truth)
-            search_other = synthetic and k < ABSENT and other_mask.sum() >= 400
-            queries.append(dataclasses.replace(shot, other=other_mask if search_other else None))
-        if not queries:
-            continue
-        # One reference for several queries: its angle to the first is drawn, those to the others come of themselves.
-        low, high = BINS[turn % 5], BINS[turn % 5 + 1]
-        angle = np.deg2rad(rng.uniform(low, high))
-        first = queries[0]
-        about = rng.uniform(0, 2 * np.pi)
-        axis = np.array([np.cos(about), np.sin(about), 0.0])
-        turned = rotation_from_vector(angle * axis) @ first.camera_from_object.rotation
-        rotation = rotation_from_vector(np.array([0, 0, np.deg2rad(rng.uniform(-20, 20))])) @ turned
-        translation = np.array([*rng.uniform(-0.03, 0.03, 2), size * rng.uniform(3.0, 4.5)])
-        pose = Similarity(rotation, translation, np.asarray(size)).to_jax()
-        light = {"direction": [*rng.normal(size=2) * 0.5, 1.0], "ambient": 0.6, "diffuse": 0.45}
-        lens = scene.camera
-        drawn = render_scene([(mesh, pose)], lens, HEIGHT, WIDTH, light=light)
-        mask = drawn.mask[0]
-        rgb = np.where(mask[..., None], drawn.rgb[0], 128).astype(np.uint8)
-        depth = sense_depth(rng, np.where(mask, drawn.depth[0], 2.0), lens, Sensor())
-        reference = Shot("photo", expose(rng, rgb, Sensor()), depth, mask, scene.matrix, rigid(rotation, translation))
-        points = mesh.vertices[np.unique(mesh.faces)] * size
-        chosen = rng.choice(len(points), min(POINTS, len(points)), replace=False)
-        model = Model(points[chosen], size, none)
-        yield Group(f"{turn:04d} {name}", mesh, size, model, reference, queries, synthetic)
-
-
-# --- measuring --------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -366,26 +233,46 @@ def search_absent(estimator, query: Shot) -> dict:
     return certainty(result.estimate) if bool(result.estimate.success) else {"failure": "no pose found"}
 
 
+RIGHT = 15  # degrees
+
+
+def is_called(row: dict) -> bool:
+    """Whether the object is called present, by the weights that the confidence has today."""
+    import jax.numpy as jnp
+
+    from ipjax.config import ConfidenceConfig
+    from ipjax.estimation.confidence import probability
+    from ipjax.records import Agreement
+
+    config = ConfidenceConfig()
+    weights = config.photo if row["key"][0] == "rgb" else config.drawn
+    return float(probability(Agreement(*jnp.asarray(row["agreement"])), jnp.asarray(weights))) >= config.least
+
+
 def table(rows: list[dict]) -> str:
-    """Markdown: by method and angle; what was not found counts as a miss, medians are of what was found."""
+    """Markdown: by method and angle; what was not found counts as a miss, the next-to-last columns are of the right."""
     lines = [
-        "| object from | angle | pairs | ADD-S < 10 % | rotation < 15° | median rotation | median shift | median size "
-        "| MSSD recall | MSPD recall |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| object from | angle | pairs | ADD-S < 10 % | rotation < 15° | < 30° | of the right: median rotation "
+        "| median shift | size within 10 % | called present | right of these | MSSD recall | MSPD recall |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    spans = [*itertools.pairwise(BINS), (0, 45), (0, 180.1)]
+    spans = [*itertools.pairwise(BINS), (0, 30), (60, 90), (0, 45), (0, 60), (0, 180.1)]
     for method in (*METHODS, *DEGRADED):
-        for low, high in spans:
+        for low, high in dict.fromkeys(spans):
             chosen = [row for row in rows if row["key"][0] == method and low <= row["angle"] < high]
             if not chosen:
                 continue
-            good = [row for row in chosen if "add_s" in row]
-            mean = lambda test, good=good, chosen=chosen: sum(test(row) for row in good) / len(chosen)
-            middle = lambda name, good=good: float(np.median([row[name] for row in good])) if good else np.nan
+            found = [row for row in chosen if "add_s" in row]
+            right = [row for row in found if row["rotation"] < RIGHT]
+            called = [row for row in found if is_called(row)]
+            mean = lambda test, found=found, chosen=chosen: sum(test(row) for row in found) / len(chosen)
+            middle = lambda name, right=right: f"{np.median([row[name] for row in right]):.0f}" if right else "–"
+            sized = f"{np.mean([abs(row['scale'] - 1) < 0.1 for row in right]):.0%}" if right else "–"
             lines.append(
                 f"| {method} | {low:.0f}–{high:.0f}° | {len(chosen)} | {mean(lambda r: r['add_s'] < 0.1):.0%} "
-                f"| {mean(lambda r: r['rotation'] < 15):.0%} | {middle('rotation'):.0f}° "
-                f"| {middle('translation_mm'):.0f} mm | {middle('scale'):.2f} "
+                f"| {len(right) / len(chosen):.0%} | {mean(lambda r: r['rotation'] < 30):.0%} "
+                f"| {middle('rotation')}° | {middle('translation_mm')} mm | {sized} "
+                f"| {len(called)} | {sum(row in right for row in called)} "
                 f"| {mean(lambda r: r['mssd_recall']):.2f} | {mean(lambda r: r['mspd_recall']):.2f} |"
             )
     return "\n".join(lines)
@@ -408,7 +295,7 @@ def write_page(path: Path, text: str, measured: str) -> None:
         "(`rgb`: its outline inflated, size unknown; `rgbd`: its depth completed, size known) or from the true mesh "
         "(`scan`, the upper bound, on at most three queries of a reference), and found in another RGB-D frame with a "
         "given mask. Angles are between the two views of the object. The photo's true pose gives the canonical frame. "
-        "Pairs where nothing was found count as misses; medians are of those found; "
+        "Pairs where nothing was found count as misses; right is a rotation within 15°, up to the object's symmetries. "
         "MSSD and MSPD recalls are means over BOP's ten thresholds.",
         "",
         f"{device['device']}, {device['cores']} cores, jax {device['jax']}, Python {device['python']}, "
@@ -420,9 +307,10 @@ def write_page(path: Path, text: str, measured: str) -> None:
 def main() -> None:
     """See the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("ycbv", "synthetic", "table"))
+    parser.add_argument("what", choices=("ycbv", "across", "synthetic", "table"))
     parser.add_argument("results", type=Path, nargs="*")
     parser.add_argument("--data", type=Path, help="a BOP data set: frames for ycbv, scans for synthetic")
+    parser.add_argument("--others", type=Path, nargs="+", help="with across: data sets of the same objects")
     parser.add_argument("--output", type=Path, help="lines of JSON (default build/photo_pairs_WHAT.jsonl)")
     parser.add_argument("--pairs", type=int, default=200)
     parser.add_argument("--page", type=Path, help="with table: write it here, too, with where it comes from")
@@ -454,10 +342,13 @@ def main() -> None:
 
     output = options.output or Path("build") / f"photo_pairs_{options.what}.jsonl"
     output.parent.mkdir(parents=True, exist_ok=True)
-    if options.what == "ycbv":
+    if options.what in ("ycbv", "across"):
         if options.data is None:
-            sys.exit("ycbv needs --data FOLDER")
-        groups = ycbv_groups(options.data)
+            sys.exit(f"{options.what} needs --data FOLDER")
+        if options.what == "across" and not options.others:
+            sys.exit("across needs --others FOLDER …: data sets with objects of the first")
+        folders = [options.data, *(options.others if options.what == "across" else [])]
+        groups = dataset_groups(folders, REPEATED if options.what == "ycbv" else None)
     else:
         groups = synthetic_groups(options.pairs, options.data, options.seed, options.queries)
     start = time.perf_counter()

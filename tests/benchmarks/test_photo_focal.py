@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import photo_focal
-from benchmarks.photo_pairs import Group, Shot, rigid
+from benchmarks.pairs import Group, Shot, rigid
 from ipjax.cameras import project
 from ipjax.files.storage.writing import append_json
 from ipjax.transforms import rotation_from_vector
