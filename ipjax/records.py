@@ -74,15 +74,18 @@ class Appearance(eqx.Module):
 
 
 class ReferenceView(eqx.Module):
-    """The photo without depth that an object was made from: its colours and directions are true, its depth is a guess.
+    """The photo that an object was made from: its colours and directions are true.
 
-    A patch of it and a patch of the query, whose depth was measured, are a ray of the photo's camera and a point in
-    space: with enough of them the photo's camera is found, and with it the object, whatever its guessed shape.
+    Where its depth is a guess, a patch of it and a patch of the query, whose depth was measured, are a ray of the
+    photo's camera and a point in space: with enough of them the photo's camera is found, and with it the object,
+    whatever its guessed shape. Where its depth was measured, poses are found by the object's surface, and the photo
+    tells which is right: of the surface that both saw, not of what was guessed behind it.
     """
 
-    view: View  # a crop that looks at the object, the rest black; depth in model units, guessed by the reconstruction
+    view: View  # a crop that looks at the object, the rest black; depth of the reconstruction's front, model units
     patches: Patches  # of that view: features centred as the templates' are, points in the object frame
     camera_from_object: Similarity  # scale 1, model units
+    measured: bool = eqx.field(static=True, default=False)  # the depth, not guessed
 
 
 class Templates(eqx.Module):
@@ -103,7 +106,7 @@ class Templates(eqx.Module):
     axes: Float[Array, "*b 3 3"]  # rows: unit axes of the smallest box around the object, about which it may look alike
     basis: Float[Array, "*b f c"] | None = None  # rows: the principal directions that features were cut to
     appearance: Appearance | None = None  # with it and the encoder, candidates are drawn and compared
-    reference: ReferenceView | None = None  # of an object from a photo without depth: its pose is found through it
+    reference: ReferenceView | None = None  # of an object from a photo: its pose is found, or chosen, through it
 
 
 class Query(eqx.Module):

@@ -135,7 +135,9 @@ def _finite_reference(reference: ReferenceView) -> tuple[ReferenceView, Bool[Arr
     view, has_camera = finite_view(reference.view)
     placed = _finite_pose(reference.camera_from_object)
     pose = _or_identity(reference.camera_from_object, placed)
-    return ReferenceView(view, finite_patches(reference.patches), pose), has_camera & placed
+    patches = finite_patches(reference.patches)
+    kept = dataclasses.replace(reference, view=view, patches=patches, camera_from_object=pose)
+    return kept, has_camera & placed
 
 
 def _finite_camera(camera: Camera) -> tuple[Camera, Bool[Array, "*b"]]:

@@ -18,10 +18,12 @@ from ipjax.files.images.depth import read_depth, remove_sentinel
 from ipjax.files.images.masks import read_mask
 from ipjax.files.objects.record import GUESS_DEVIATION, ObjectInfo, Reference
 from ipjax.files.objects.saving import save
+from ipjax.files.weights.encoder import load_encoder
 from ipjax.files.weights.hashes import hash_file
 from ipjax.inference.cutting import undistort_frame
 from ipjax.inference.depth import check_depth_unit, find_depth_scale, sample_depth, to_metres
 from ipjax.onboarding.foreground import Foreground, Photo, find_foreground, read_photo
+from ipjax.onboarding.measured_photo import describe_measured_photo
 from ipjax.onboarding.mesh import onboard
 from ipjax.onboarding.photo_views import ReferencePhoto
 from ipjax.onboarding.reconstruction.methods import METHODS
@@ -111,13 +113,23 @@ def onboard_photo(
     )
     path = None if isinstance(source, Photo) else Path(source)
     name = name or (path.stem if path else "object")
-    reference = None
-    if prepared.depth is None and made.camera_from_mesh is not None and made.camera is not None:
-        shown = prepared.foreground
+    encoder = load_encoder() if encoder is None else encoder
+    shown, reference = prepared.foreground, None
+    if made.camera_from_mesh is not None and made.camera is not None:
         reference = ReferencePhoto(shown.rgb, shown.mask, made.camera_from_mesh, made.camera)
+    measured = prepared.depth is not None
     templates, info = onboard(
-        made.mesh, encoder, config, name=name, reference=reference, progress=progress, backend=backend
+        made.mesh,
+        encoder,
+        config,
+        name=name,
+        reference=None if measured else reference,
+        progress=progress,
+        backend=backend,
     )
+    if measured and reference is not None:
+        view = describe_measured_photo(reference, made.mesh, templates, encoder, config, backend=backend)
+        templates = dataclasses.replace(templates, reference=view)
     info = dataclasses.replace(
         info,
         mesh_file=path.name if path else "",
