@@ -41,8 +41,8 @@ measured is kept; --size says another, --free-size lets it be found.
       --compare compare.png --mesh-out mug.ply
 
 An object made from a photo without depth is found through that photo. --compare shows the image as the photo's camera
-would have seen it, beside the photo: where the pose is right, the two fit together. Its --mesh-out has, in place of the
-front that was guessed, the one that was measured.
+would have seen it, beside the photo (which may have had depth): where the pose is right, the two fit together. Without
+depth, --mesh-out has, in place of the front that was guessed, the one that was measured.
 """
 
 MESHES = (".ply", ".glb", ".obj", ".stl")
@@ -101,8 +101,7 @@ def add(commands: Any) -> None:
         "--compare",
         type=Path,
         metavar="PNG",
-        help="of objects made from a photo without depth: the photo, and the image drawn into its view (with --frames: "
-        "a folder)",
+        help="of objects made from a photo: the photo, and the image drawn into its view (with --frames: a folder)",
     )
     parser.add_argument(
         "--mesh-out",
@@ -206,9 +205,7 @@ def _check_objects(objects: list[tuple[Any, Any]], arguments: argparse.Namespace
     """Refuse what these object files cannot give, before weights are loaded and anything is compiled."""
     for path, (templates, info) in zip(arguments.objects, objects, strict=True):
         if arguments.compare is not None and templates.reference is None:
-            raise ValueError(
-                f"--compare: {path} keeps no photo without depth that it was made from, so nothing to compare with"
-            )
+            raise ValueError(f"--compare: {path} keeps no photo that it was made from, so nothing to compare with")
         if arguments.mesh_out is not None and (info.vertices is None or info.faces is None):
             raise ValueError(f"--mesh-out: {path} keeps no mesh")
 

@@ -16,24 +16,14 @@ from ipjax.estimation.alignment import align
 from ipjax.estimation.confidence import covariance, find_rival, pair_information, probability, rotation_ambiguity
 from ipjax.estimation.features import identity_of, object_features
 from ipjax.estimation.matching import match, select
-from ipjax.estimation.photo.resection import draw_query, measure_sight
+from ipjax.estimation.photo.choice import judge_by_photo
 from ipjax.estimation.photo.through_photo import estimate_through_photo
 from ipjax.estimation.refinement import information, refine, settle
 from ipjax.estimation.scene import SceneGrid
 from ipjax.estimation.scoring import score, score_drawn, seen_share
 from ipjax.estimation.validity import finite_estimate, finite_query, finite_templates
 from ipjax.metrics.poses import turn_angle
-from ipjax.records import (
-    Agreement,
-    Hypotheses,
-    Pairs,
-    Patches,
-    PoseEstimate,
-    Query,
-    ReferenceView,
-    Similarity,
-    Templates,
-)
+from ipjax.records import Agreement, Hypotheses, Pairs, Patches, PoseEstimate, Query, Similarity, Templates
 
 
 def estimate(
@@ -100,8 +90,7 @@ def estimate(
     if config.score.ranking == "render":
         found = _rounds(templates, query, scene, found, config, scale_known=scale_known)
         if encoder is not None and drawing:
-            by_photo = templates.reference is not None
-            found = (_draw_into_photo if by_photo else _draw_best)(encoder, templates, query, found, config)
+            found = _draw_best(encoder, templates, query, found, config)
     order = lax.top_k(found.score, found.score.shape[0])[1]
     found = jax.tree.map(lambda x: x[order], found)
     if config.refine.settle and config.refine.steps:
@@ -283,10 +272,20 @@ def _draw_best(
     found: _Candidates,
     config: Config,
 ) -> _Candidates:
-    """The best candidates, each different from the others, scored by what they look like, too."""
-    count = min(config.score.drawn, found.score.shape[0])
+    """The best candidates, each different from the others, scored by what they look like, too.
+
+    Those of an object from a photo with depth are scored by the photo alone (`photo.choice`).
+    """
+    by_photo = templates.reference is not None
+    count = min(config.resect.drawn if by_photo else config.score.drawn, found.score.shape[0])
     chosen, ahead = distinct(found.poses, found.score, count, config.score.apart)
     kept = jax.tree.map(lambda x: x[chosen], found)
+    determined = kept.determined & ahead
+    if by_photo:
+        with jax.named_scope("draw"):
+            rated, overlap, colour = judge_by_photo(encoder, templates, query, kept.poses, config)
+        agreement = eqx.tree_at(lambda a: (a.drawn, a.colour), kept.agreement, (overlap, colour))
+        return _Candidates(kept.poses, determined, jnp.where(determined, rated, -1), agreement)
     # Compiled for one platform, but traced for both: jitted, it is traced once.
     rate = jax.jit(lambda pose, undrawn: score_drawn(encoder, templates, query, pose, undrawn, config.score))
     with jax.named_scope("draw"):
@@ -294,53 +293,7 @@ def _draw_best(
         rated, agreement = lax.platform_dependent(
             kept.poses, kept.agreement, cpu=lambda *x: lax.map(lambda one: rate(*one), x), default=jax.vmap(rate)
         )
-    determined = kept.determined & ahead
     return _Candidates(kept.poses, determined, jnp.where(determined, rated, -1), agreement)
-
-
-def _draw_into_photo(
-    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
-    templates: Templates,
-    query: Query,
-    found: _Candidates,
-    config: Config,
-) -> _Candidates:
-    """The best candidates of an object from a photo with depth, each different from the others, scored by the photo.
-
-    The query's measured surface is drawn into the photo's camera and compared where both show the object. Drawing the
-    object into the query instead, and how well it fits the depth, would let the guessed back vote: among candidates
-    that refinement fitted to the depth, a wrong one often fits it best.
-    """
-    reference = templates.reference
-    assert reference is not None
-    count = min(config.resect.drawn, found.score.shape[0])
-    chosen, ahead = distinct(found.poses, found.score, count, config.score.apart)
-    kept = jax.tree.map(lambda x: x[chosen], found)
-    sight = measure_sight(reference, query)
-
-    @jax.jit  # compiled for one platform, but traced for both
-    def rate(pose):
-        photo_from_query = photo_camera(reference, pose)
-        drawing = draw_query(encoder, templates, query, *photo_from_query, sight, config.resect)
-        return drawing.overlap, drawing.colour
-
-    with jax.named_scope("draw"):
-        overlap, colour = lax.platform_dependent(
-            kept.poses, cpu=lambda poses: lax.map(rate, poses), default=jax.vmap(rate)
-        )
-    rated = overlap * jnp.exp(config.score.colour_weight * (colour - 1))
-    agreement = eqx.tree_at(lambda a: (a.drawn, a.colour), kept.agreement, (overlap, colour))
-    determined = kept.determined & ahead
-    return _Candidates(kept.poses, determined, jnp.where(determined, rated, -1), agreement)
-
-
-def photo_camera(
-    reference: ReferenceView, camera_from_object: Similarity
-) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-    """The photo's camera from the query's, rotation and translation in metres, by the object's pose in the query's."""
-    photo, pose = reference.camera_from_object, camera_from_object
-    turn = jnp.matmul(photo.rotation, pose.rotation.T, precision="highest")
-    return turn, pose.scale * photo.translation - jnp.matmul(turn, pose.translation, precision="highest")
 
 
 def distinct(

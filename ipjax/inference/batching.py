@@ -46,7 +46,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     What is added is absent. Patches are not valid. Views repeat the last one's pose and camera without a valid patch:
     they rank behind all others and no feature is taken from them. Surface and appearance points repeat the first one
     with a normal of zero: they face no camera, so they are neither fitted nor drawn and widen no outline. Reference
-    views are not padded: all have one size, as objects from photos have that were onboarded alike.
+    views are not padded: all have one size, as objects from photos have that were onboarded alike. Photos with depth,
+    which only choose among poses, are left out where not all of the objects have one.
     An object's estimate is the same as without padding, up to rounding, if it has at least ``config.match.views`` views
     and ``config.refine.points`` surface points; with fewer, it gets as many hypotheses and points as the others.
 
@@ -76,6 +77,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     for name in ("basis", "appearance"):
         if len({getattr(o, name) is None for o in objects}) > 1:
             raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
+    if not all(o.reference is not None and o.reference.measured for o in objects):
+        objects = [_without_measured_photo(o) for o in objects]
     _check_references(objects)
     views, patches = (max(o.norm.shape[axis] for o in objects) for axis in (0, 1))
     count = max(o.surface.points.shape[0] for o in objects)
@@ -97,6 +100,12 @@ def _check_references(objects: list[Templates]) -> None:
     if len(sizes) > 1:
         told = " and ".join(f"{list(pixels)} pixels with {patches[0]} patches" for pixels, patches in sizes)
         raise ValueError(f"the reference views of these objects differ in size, {told}; onboard them alike")
+
+
+def _without_measured_photo(templates: Templates) -> Templates:
+    """Without the reference view of a photo with depth: objects that have none beside it are chosen without one."""
+    reference = templates.reference
+    return dataclasses.replace(templates, reference=None) if reference is not None and reference.measured else templates
 
 
 def _encoders(templates: Templates) -> list[str | None]:

@@ -49,10 +49,13 @@ _UNITS = {
 
 
 def to_dictionary(record: Any) -> dict[str, Any]:
-    """A record of ``ipjax.records`` as nested dictionaries of arrays, by field name."""
+    """A record of ``ipjax.records`` as nested dictionaries of arrays, by field name.
+
+    Without the photo that serves only to choose among drawn candidates: exported graphs hold no encoder to draw with.
+    """
     fields = record.__dataclass_fields__
     values = {name: getattr(record, name) for name, field in fields.items() if not field.metadata.get("static")}
-    present = {name: x for name, x in values.items() if x is not None}
+    present = {name: x for name, x in values.items() if x is not None and not getattr(x, "measured", False)}
     return {name: to_dictionary(x) if hasattr(x, "__dataclass_fields__") else x for name, x in present.items()}
 
 

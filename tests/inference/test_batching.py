@@ -80,3 +80,24 @@ def test_an_exported_graph_takes_the_reference_view(monkeypatch):
         found = estimate_dictionaries(to_dictionary(one), to_dictionary(query), key, TINY)
         jax.tree.map(np.testing.assert_array_equal, given[-1], one)
         jax.tree.map(np.testing.assert_array_equal, found, to_dictionary(query))
+
+
+def test_photos_with_depth_are_padded_only_beside_their_like():
+    """They only choose among poses, so that an object from a mesh may stand beside one of them."""
+    first, second = (measured(templates) for templates in two_photos())
+    both = ipjax.pad_templates([first, second])
+    assert both.reference is not None and both.reference.measured
+    assert ipjax.pad_templates([first, dataclasses.replace(second, reference=None)]).reference is None
+    with pytest.raises(ValueError, match=r"from a photo without depth, .* and some were not"):
+        ipjax.pad_templates([first, two_photos()[1]])
+
+
+def test_an_exported_graph_leaves_out_a_photo_with_depth():
+    """Nothing is drawn in it that the photo could judge."""
+    given = to_dictionary(measured(with_reference(problems.make_templates(), side=112)))
+    wanted = to_dictionary(problems.make_templates())
+    assert jax.tree.structure(given) == jax.tree.structure(wanted)
+
+
+def measured(templates):
+    return dataclasses.replace(templates, reference=dataclasses.replace(templates.reference, measured=True))

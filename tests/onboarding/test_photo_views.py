@@ -111,14 +111,3 @@ def test_patches_of_an_object_from_a_photo_know_their_place_in_it():
     column, row = np.round(project(whole.matrix, rays)).astype(int).T
     shown = 255 * np.asarray(reference.view.rgb)[tuple(np.round(middle).astype(int).T[::-1])]
     assert np.abs((shown - rgb[row, column]).mean(0)).max() < 2  # grey levels
-
-
-def test_a_photo_with_depth_has_no_reference_view():
-    whole = problems.make_frame(3)
-    config = OnboardConfig(directions=2, rolls=1, resolution=112, surface=256, appearance=0)
-    made = onboard_photo(
-        Photo(np.asarray(whole.rgb)), problems.make_encoder(), config, mask=whole.mask, depth=np.asarray(whole.depth),
-        camera=whole.matrix, progress=False,
-    )  # fmt: skip
-    assert made.templates.reference is None
-    assert len(made.templates.camera_from_object.scale) == 2

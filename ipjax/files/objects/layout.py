@@ -17,13 +17,14 @@ mesh, and a checksum. Tensors, for v templates of p patches with c channels, and
     reference.rotation f32 [3 3] · reference.translation f32 [3] · reference.focal, reference.centre f32 [2]
 
 Lengths are model units: the object's bounding box is centred at the origin and its diameter is 1. Of the tensors under
-``appearance.`` and of those under ``reference.`` a file holds all or none. The latter are the photo without depth that
-the object was made from, as ``ipjax.records.ReferenceView`` has it: a square crop whose depth was guessed by the
-reconstruction, its patches in the object's frame, and ``camera_from_object`` with its camera. ``photo`` is there
-for people, with or without them. Templates that were saved after ``ipjax.compact`` have fewer patches than the
-photo, which keeps all of its own.
+``appearance.`` and of those under ``reference.`` a file holds all or none. The latter are the photo that the object was
+made from, as ``ipjax.records.ReferenceView`` has it: a square crop with the depth of the reconstruction's front, its
+patches in the object's frame, and ``camera_from_object`` with its camera. ``depth_measured`` in the metadata tells
+whether that depth was measured or guessed. ``photo`` is there for people, with or without them. Templates that were
+saved after ``ipjax.compact`` have fewer patches than the photo, which keeps all of its own.
 
-Format 1 had no ``reference.`` tensors; its files are read as they are, and have no reference view.
+Format 1 had no ``reference.`` tensors; its files are read as they are, and have no reference view. Format 2 had them of
+photos without depth only, and no ``depth_measured``.
 """
 
 import hashlib
@@ -32,8 +33,8 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 2  # the one written
-READABLE = (1, FORMAT)
+FORMAT = 3  # the one written
+READABLE = (1, 2, FORMAT)
 SUFFIX = ".ipjax"
 
 TEMPLATE_TENSORS = {

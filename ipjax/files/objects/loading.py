@@ -70,7 +70,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
             axes=device["axes"],
             basis=jnp.asarray(tensors["basis"]) if "basis" in tensors else None,
             appearance=_make_appearance(tensors),
-            reference=_make_reference_view(tensors, made_by),
+            reference=_make_reference_view(tensors, made_by, measured=header.get("depth_measured") is True),
         ),
         info,
     )
@@ -94,7 +94,9 @@ def _make_appearance(tensors: dict[str, np.ndarray]) -> Appearance | None:
     )
 
 
-def _make_reference_view(tensors: dict[str, np.ndarray], made_by: str | None) -> ReferenceView | None:
+def _make_reference_view(
+    tensors: dict[str, np.ndarray], made_by: str | None, *, measured: bool
+) -> ReferenceView | None:
     if "reference.rgb" not in tensors:
         return None
     device = {name: jnp.asarray(x) for name, x in tensors.items() if name.startswith("reference.")}
@@ -117,6 +119,7 @@ def _make_reference_view(tensors: dict[str, np.ndarray], made_by: str | None) ->
             translation=device["reference.translation"],
             scale=jnp.ones((), jnp.float32),
         ),
+        measured=measured,
     )
 
 
@@ -146,9 +149,8 @@ def check(path: str | Path) -> list[str]:
     made = [] if photo is None else [f"made from the photo by {photo.method}; {photo.seen:.0%} of its surface was seen"]
     if "reference.rgb" in tensors:
         side, shown = len(tensors["reference.rgb"]), tensors["reference.valid"]
-        made.append(
-            f"poses are found through the photo: {side} pixels wide, {shown.sum()} of its {len(shown)} patches valid"
-        )
+        used = "chosen by" if header.get("depth_measured") is True else "found through"
+        made.append(f"poses are {used} the photo: {side} pixels wide, {shown.sum()} of its {len(shown)} patches valid")
     return [
         f"object {info.name!r} from {info.mesh_file or 'a mesh'} (sha256 {info.mesh_sha256[:12] or 'unknown'})",
         f"diameter {size:g} in the mesh's unit{unit}",

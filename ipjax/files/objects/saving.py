@@ -99,6 +99,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
     }
     if info.reference is not None:
         header["reference"] = info.reference.as_json()
+    if templates.reference is not None:
+        header["depth_measured"] = bool(templates.reference.measured)
     header = json.loads(json.dumps(header, allow_nan=False))
     text = json.dumps(header | {"content_sha256": hash_content(header, tensors)})
     with writing(path) as temporary:

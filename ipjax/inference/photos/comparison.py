@@ -53,7 +53,7 @@ def photo_panels(
     """The three images of :func:`compare_with_photo`, without captions. Raises ValueError as it does."""
     reference = templates.reference
     if reference is None:
-        raise ValueError("the object was not made from a photo without depth: there is no photo to compare with")
+        raise ValueError("the object keeps no photo that it was made from: there is none to compare with")
     photo, mask = np.asarray(reference.view.rgb), np.asarray(reference.view.mask)
     if bool(estimate.success):
         drawing = draw_query_into_photo(templates, query, estimate)

@@ -32,7 +32,8 @@ def pose_mesh(result: Result) -> Mesh:
     if info.vertices is None or info.faces is None or not len(info.faces):
         raise ValueError(f"{info.name}: the object file keeps no mesh")
     vertices = np.asarray(info.vertices, np.float64)
-    if result.templates.reference is None:
+    reference = result.templates.reference
+    if reference is None or reference.measured:
         placed = pose @ vertices
     else:
         placed = correct_front(vertices, result.templates, result.query, result.crop_estimate)

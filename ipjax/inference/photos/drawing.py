@@ -51,12 +51,13 @@ def draw_query_into_photo(templates: Templates, query: Query, estimate: PoseEsti
     """
     reference = templates.reference
     if reference is None:
-        raise ValueError("the object was not made from a photo without depth: there is no photo to draw the query into")
+        raise ValueError("the object keeps no photo that it was made from: there is none to draw the query into")
     if not bool(estimate.success):
         raise ValueError("no pose was found, so the query cannot be drawn into the photo's view")
     camera = reference_from_query(reference, estimate.camera_from_object)
-    # Only a given size has no deviation.
-    behind = 0.0 if float(estimate.scale_std) > 0 else _find_distance(reference, query, camera, estimate)
+    # Only a given size has no deviation; what was measured is where it was measured whatever the size.
+    kept = float(estimate.scale_std) > 0 or reference.measured
+    behind = 0.0 if kept else _find_distance(reference, query, camera, estimate)
     camera = _ahead(camera, behind)
     paint, depth = _draw(reference, query, camera)
     shown = depth > 0

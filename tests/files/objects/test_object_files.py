@@ -80,6 +80,33 @@ def test_the_reference_view_comes_back(photo_file, tmp_path):
     assert load(plain)[0].reference is None and not any("through the photo" in line for line in check(plain))
 
 
+def test_whether_the_photo_had_depth_comes_back(tmp_path):
+    templates, info = make_object()
+    guessed = with_reference(templates)
+    assert guessed.reference is not None
+    measured = dataclasses.replace(guessed, reference=dataclasses.replace(guessed.reference, measured=True))
+    for wanted, words in ((guessed, "found through"), (measured, "chosen by")):
+        path = save(tmp_path / "a.ipjax", wanted, info)
+        again, _ = load(path)
+        assert jax.tree.structure(again) == jax.tree.structure(wanted)
+        assert sum(f"poses are {words} the photo" in line for line in check(path)) == 1
+
+
+def test_files_of_format_2_have_photos_without_depth(photo_file):
+    """As an earlier ipjax wrote them, which did not tell."""
+    from safetensors.numpy import load_file
+
+    wanted, tensors = load(photo_file)[0], load_file(photo_file)
+
+    def older(text):
+        header = {name: entry for name, entry in json.loads(text).items() if name != "depth_measured"} | {"format": 2}
+        return json.dumps(header | {"content_sha256": hash_content(header, tensors)})
+
+    rewrite(photo_file, metadata=older)
+    assert jax.tree.structure(load(photo_file)[0]) == jax.tree.structure(wanted)
+    assert "format 2" in " ".join(check(photo_file))
+
+
 def test_compacted_templates_are_saved_beside_the_whole_photo(tmp_path):
     templates, info = make_object(patches=16)
     few = dataclasses.replace(templates.patches, valid=jnp.arange(16) < jnp.full((5, 1), 3))
@@ -105,7 +132,7 @@ def test_files_of_format_1_are_read(file):
     found, _ = load(file)
     jax.tree.map(np.testing.assert_array_equal, wanted, found)
     assert found.reference is None
-    assert check(file) == [line.replace("format 2", "format 1") for line in told]
+    assert check(file) == [line.replace("format 3", "format 1") for line in told]
 
 
 @pytest.mark.parametrize(

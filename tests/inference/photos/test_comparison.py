@@ -93,7 +93,7 @@ def test_without_a_pose_only_the_photo_is_shown(pairs):
 def test_an_object_without_such_a_photo_is_refused(pairs):
     pair = pairs[0]
     scan = dataclasses.replace(pair.templates, reference=None)
-    with pytest.raises(ValueError, match="photo without depth"):
+    with pytest.raises(ValueError, match="keeps no photo"):
         compare_with_photo(scan, pair.query, estimate_at_the_truth(pair)[0])
-    with pytest.raises(ValueError, match="photo without depth"):
+    with pytest.raises(ValueError, match="keeps no photo"):
         draw_query_into_photo(scan, pair.query, estimate_at_the_truth(pair)[0])

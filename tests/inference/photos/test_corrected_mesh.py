@@ -150,4 +150,4 @@ def test_the_command_writes_comparison_and_mesh(pairs, case, monkeypatch, capfd)
     assert "must end in .png" in capfd.readouterr().err
     scan = ["estimate", case / "mug.ipjax", *inputs, "--compare", case / "no.png"]
     assert run([*map(str, scan)]) == 2
-    assert "keeps no photo without depth" in capfd.readouterr().err and not (case / "no.png").exists()
+    assert "keeps no photo that it was made from" in capfd.readouterr().err and not (case / "no.png").exists()
