@@ -12,7 +12,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ipjax.config import Config
-from ipjax.estimation.photo.resection import draw_query, measure_sight
+from ipjax.estimation.photo.drawing import draw_query
+from ipjax.estimation.photo.resection import measure_sight
 from ipjax.records import Query, ReferenceView, Similarity, Templates
 
 
