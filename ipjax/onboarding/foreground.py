@@ -174,7 +174,7 @@ def _find(photo, mask, box, click, attempts) -> Foreground:
         matting, without = find_matting()
         if matting is not None:
             try:
-                found = matte(rgb, matting)
+                found = matte(matting, rgb)
             except MattingError as error:
                 raise ForegroundError(str(error)) from None
             return _accept(photo, found, "matting", attempts)

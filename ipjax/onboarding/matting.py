@@ -39,7 +39,7 @@ def find_matting() -> tuple[str | None, str]:
     )
 
 
-def matte(rgb: UInt8[np.ndarray, "h w 3"], model: str) -> Bool[np.ndarray, "h w"]:
+def matte(model: str, rgb: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
     """What a model of rembg takes for the foreground.
 
     Raises MattingError in one sentence: the package does not work, or its answer is no mask of the photo.
