@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from ipjax.inference.frames import frame, frame_turned
     from ipjax.onboarding.mesh import onboard
     from ipjax.onboarding.photo import onboard_photo
+    from ipjax.onboarding.photographed import onboard_with_photo
     from ipjax.records import Camera, Patches, PoseEstimate, Query, ReferenceView, Surface, Templates, View
     from ipjax.synthetic.degradation import degrade
     from ipjax.synthetic.objects import make_object
@@ -89,6 +90,7 @@ __all__ = [
     "observe",
     "onboard",
     "onboard_photo",
+    "onboard_with_photo",
     "pad_templates",
     "read_camera",
     "read_candidates",
@@ -151,6 +153,7 @@ _HOMES = {
     ),
     "onboarding.mesh": ("onboard",),
     "onboarding.photo": ("onboard_photo",),
+    "onboarding.photographed": ("onboard_with_photo",),
     "records": (
         "Camera",
         "Patches",

@@ -107,6 +107,9 @@ class Templates(eqx.Module):
     basis: Float[Array, "*b f c"] | None = None  # rows: the principal directions that features were cut to
     appearance: Appearance | None = None  # with it and the encoder, candidates are drawn and compared
     reference: ReferenceView | None = None  # of an object from a photo: its pose is found, or chosen, through it
+    # Where the camera stood of the photo that a mesh from elsewhere was made from, model units; what it did not see, an
+    # image-to-3D model invented.
+    photo_centre: Float[Array, "*b 3"] | None = None
 
 
 class Query(eqx.Module):

@@ -20,17 +20,20 @@ examples:
   ipjax onboard mug.jpg --box 210,130,90,120 -o mug.ipjax  the mask is cut out inside the box
   ipjax onboard rgb.png --mask mask.png --depth depth.png --camera camera.json --depth-scale 0.001 -o mug.ipjax
                                                            the front is measured, and so is the size
+  ipjax onboard made.glb --photo mug.jpg -o mug.ipjax      a mesh that SAM 3D, InstantMesh … made, and its photo
 
 The mesh may be a scan, CAD, or what a single-view reconstruction made: in any frame and unit, coloured by a texture or
 by vertices. A photo becomes a mesh by TripoSR where its weights are, else without learned weights: its outline is
 inflated, or its depth completed. The report shows what was seen and what was guessed. An object from a photo without
-depth is found through that photo: its rotation does not rest on the guessed shape.
+depth is found through that photo: its rotation does not rest on the guessed shape. An image-to-3D model invents what
+its photo did not show; with the photo beside the mesh, a pose that rests on that is called less sure.
 """
 PHOTOS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Options that make sense for a photo only, as argparse names them.
 PHOTO_ONLY = ("mask", "mask_label", "box", "click", "depth", "camera", "image", "depth_scale")
 PHOTO_ONLY += ("lrm", "lrm_weights", "save_mesh")
+WITH_MESH = ("mask", "mask_label", "box", "click")  # of them, those that also belong to the photo beside a mesh
 
 
 def add(commands: Any) -> None:
@@ -59,6 +62,9 @@ def add(commands: Any) -> None:
     )
     photo.add_argument("--click", type=parse_numbers, metavar="X,Y", help="cut out the object at this pixel")
     options.add_depth(photo, "depth aligned to the photo: metric front and size")
+    beside = parser.add_argument_group("meshes that an image-to-3D model made (with --mask, --box or --click)")
+    beside.add_argument("--photo", type=Path, metavar="PHOTO", help="the photo that the mesh was made from")
+    beside.add_argument("--photo-camera", metavar="FILE", help="its camera: BOP JSON, ROS CameraInfo, or fx,fy,cx,cy")
     photo.add_argument("--lrm", choices=("triposr", "inflate", "auto"), help="who makes the mesh (default auto)")
     photo.add_argument("--lrm-weights", type=Path, metavar="FILE", help="TripoSR's checkpoint")
     photo.add_argument("--save-mesh", type=Path, metavar="GLB", help="also write the reconstructed mesh")
@@ -71,7 +77,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
 
     start = time.perf_counter()
     config = options.change(arguments, OnboardConfig(**options.read_views(arguments, "channels")))
-    make = _from_photo if is_photo else _from_mesh
+    make = _from_photo if is_photo else _from_mesh if arguments.photo is None else _from_mesh_with_photo
     templates, info, encoder, photo = make(arguments, config)
     warned: tuple[str, ...] = ()
     if arguments.report is not None:
@@ -83,6 +89,10 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
 
         source = load_mesh(arguments.source) if photo is None else photo.reconstruction.mesh
         mesh = normalise(clean(source)[0])
+        if templates.photo_centre is not None:
+            from ipjax.onboarding.photographed import mark_vertices
+
+            mesh = mark_vertices(mesh, templates)
         found = examine(templates, info, mesh, encoder, config, backend=arguments.backend)
         write_report(arguments.report, templates, info, mesh, found, photo, backend=arguments.backend)
         warned = found.warnings
@@ -127,7 +137,12 @@ def _check(arguments: argparse.Namespace) -> bool:
     is_photo = source.suffix.lower() in PHOTOS
     if not source.is_file():
         raise ValueError(f"{source}: no such {'photo' if is_photo else 'mesh'}")
-    for name in PHOTO_ONLY if not is_photo else ("unit",):
+    if arguments.photo is None and arguments.photo_camera is not None:
+        raise ValueError("--photo-camera belongs to --photo")
+    if arguments.photo is not None and not is_photo and not arguments.photo.is_file():
+        raise ValueError(f"{arguments.photo}: no such photo")
+    mesh_refuses = [name for name in PHOTO_ONLY if arguments.photo is None or name not in WITH_MESH]
+    for name in mesh_refuses if not is_photo else ("unit", "photo"):
         if getattr(arguments, name) is not None:
             other = "a mesh" if not is_photo else "a photo"
             raise ValueError(f"{source}: --{name.replace('_', '-')} does not belong to {other}")
@@ -149,19 +164,28 @@ def _from_mesh(arguments: argparse.Namespace, config: Any) -> tuple[Any, Any, An
     return templates, info, encoder, None
 
 
+def _from_mesh_with_photo(arguments: argparse.Namespace, config: Any) -> tuple[Any, Any, Any, None]:
+    from ipjax.inference.compilation_cache import use_compilation_cache
+    from ipjax.onboarding.photo import prepare_photo
+    from ipjax.onboarding.photographed import onboard_with_photo
+
+    given = _read_mask(arguments) | {"camera": _read_camera(arguments.photo_camera, None, arguments.photo)}
+    # A bad photo is refused before weights are loaded and anything is compiled.
+    prepare_photo(arguments.photo, **given)
+    encoder = options.load_encoder(arguments)
+    use_compilation_cache()
+    given["metres_per_unit"] = None if arguments.unit is None else UNITS[arguments.unit]
+    given["photo"] = arguments.photo
+    found = onboard_with_photo(arguments.source, encoder, config, **given, **_shared(arguments))
+    return *found, encoder, None
+
+
 def _from_photo(arguments: argparse.Namespace, config: Any) -> tuple[Any, Any, Any, Any]:
     from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.onboarding.photo import onboard_photo, prepare_photo
 
-    given = {name: getattr(arguments, name) for name in ("mask", "box", "click", "depth", "depth_scale")}
-    given["camera"] = _read_camera(arguments)
-    if arguments.mask_label is not None:
-        if arguments.mask is None:
-            raise ValueError("--mask-label belongs to --mask")
-        from ipjax.files.images.masks import read_mask
-
-        given["mask"] = read_mask(arguments.mask, arguments.mask_label)
-    given["tried"] = arguments.output.with_suffix(".tried.png")
+    given = _read_mask(arguments) | {"depth": arguments.depth, "depth_scale": arguments.depth_scale}
+    given["camera"] = _read_camera(arguments.camera, arguments.image, arguments.source)
     # A bad photo is refused before weights are loaded and anything is compiled.
     prepare_photo(arguments.source, **given)
     encoder = options.load_encoder(arguments)
@@ -185,15 +209,27 @@ def _shared(arguments: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def _read_camera(arguments: argparse.Namespace) -> Any:
-    if arguments.camera is None:
+def _read_mask(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What tells the object in the photo, and where a picture goes when nothing does."""
+    given = {name: getattr(arguments, name) for name in ("mask", "box", "click")}
+    if arguments.mask_label is not None:
+        if arguments.mask is None:
+            raise ValueError("--mask-label belongs to --mask")
+        from ipjax.files.images.masks import read_mask
+
+        given["mask"] = read_mask(arguments.mask, arguments.mask_label)
+    return given | {"tried": arguments.output.with_suffix(".tried.png")}
+
+
+def _read_camera(camera: str | None, image: int | None, photo: Path) -> Any:
+    """The photo's camera; of a scene's, that of the image which the photo's name numbers."""
+    if camera is None:
         return None
     from ipjax.files.cameras.reading import read_camera
 
-    image = arguments.image
-    if image is None and arguments.source.stem.isdigit():
-        image = int(arguments.source.stem)
-    return read_camera(parse_camera(arguments.camera), image)
+    if image is None and photo.stem.isdigit():
+        image = int(photo.stem)
+    return read_camera(parse_camera(camera), image)
 
 
 def _diameter(info: Any, is_photo: bool) -> str:

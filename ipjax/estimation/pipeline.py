@@ -166,6 +166,8 @@ def _certainty(
     if config.score.ranking == "render":
         weights = config.confidence.drawn if drawing else config.confidence.undrawn
         weights = jnp.stack([jnp.asarray(x, found.score.dtype) for x in weights])
+        if templates.photo_centre is not None:  # a pose that rests on what was invented is not sure
+            weights = weights.at[0].add(-config.confidence.invented).at[5].add(config.confidence.invented)
         confidence = jnp.where(best.determined, probability(agreement, weights), 0)
         present = best.determined & (confidence >= config.confidence.least)
     else:  # the share of pairs that agree is no probability

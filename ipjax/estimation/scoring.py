@@ -47,6 +47,9 @@ def score(
     one, later = jnp.ones_like(geometry), jnp.zeros_like(geometry)  # only the chosen one needs what comes later
     undrawn = Agreement(geometry, features, drawn=one, colour=later, seen=later, rival=later)
     if encoder is None:
+        if templates.photo_centre is not None:
+            trust = trusted_share(templates, camera_from_object, config)
+            features = trust * features + (1 - trust) * config.guess
         return geometry * features**config.power, undrawn
     return score_drawn(encoder, templates, query, camera_from_object, undrawn, config)
 
@@ -66,7 +69,7 @@ def score_drawn(
     """
     drawn, colour = drawn_agreement(encoder, templates, query, camera_from_object, config)
     # What a guessed surface looks like says little, be it like the photo or unlike it.
-    trust = seen_share(templates.surface, camera_from_object)
+    trust = trusted_share(templates, camera_from_object, config)
     known = lambda agreement: trust * agreement + (1 - trust) * config.guess
     looks = known(undrawn.features) ** config.power * known(drawn)
     total = undrawn.depth**config.depth_power * looks * jnp.exp(config.colour_weight * (trust * colour - 1))
@@ -110,6 +113,18 @@ def seen_share(surface: Surface, camera_from_object: Similarity) -> Float[Array,
     facing = -jnp.sum(_turn_normals(camera_from_object, surface.normals) * placed, axis=-1)
     area = jnp.maximum(facing, 0) / jnp.maximum(jnp.sum(placed * placed, axis=-1), 1e-12) ** 1.5
     return jnp.sum(area * surface.seen) / jnp.maximum(jnp.sum(area), 1e-12)
+
+
+def trusted_share(
+    templates: Templates, camera_from_object: Similarity, config: ScoreConfig = ScoreConfig()
+) -> Float[Array, ""]:
+    """How much of what the object looks like at a hypothesis counts when candidates are compared; the rest is assumed.
+
+    What was guessed from a photo counts nothing. What an image-to-3D model invented does, but for ``config.invented``:
+    it often looks as the object does.
+    """
+    seen = seen_share(templates.surface, camera_from_object)
+    return seen if templates.photo_centre is None else 1 - config.invented * (1 - seen)
 
 
 def closeness(templates: Templates, camera_from_object: Similarity) -> Float[Array, "v"]:

@@ -101,6 +101,7 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
         basis=None if templates.basis is None else _or_zero(templates.basis),
         appearance=None if templates.appearance is None else _finite_points(templates.appearance)[0],
         reference=reference,
+        photo_centre=None if templates.photo_centre is None else _or_zero(templates.photo_centre),
     )
     return kept, jnp.all(usable)
 

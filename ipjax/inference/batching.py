@@ -74,7 +74,7 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     if len(encoders) > 1:
         raise ValueError(f"these objects were onboarded with different encoders: {', '.join(map(repr, encoders))}")
     objects = [_described_by(o, None) for o in objects]
-    for name in ("basis", "appearance"):
+    for name in ("basis", "appearance", "photo_centre"):
         if len({getattr(o, name) is None for o in objects}) > 1:
             raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
     if not all(o.reference is not None and o.reference.measured for o in objects):

@@ -33,6 +33,7 @@ PROMISE = (
 _UNITS = {
     "templates.patches.points": "model units (diameters), object frame",
     "templates.camera_from_object.translation": "model units",
+    "templates.photo_centre": "model units (diameters), object frame",
     "templates.reference.patches.points": "model units (diameters), object frame",
     "templates.reference.camera_from_object.translation": "model units",
     "templates.reference.view.depth": "model units along z, 0 = unknown",

@@ -136,7 +136,7 @@ def onboard_photo(
         mesh_sha256=hash_file(path) if path else "",
         metres_per_unit=1.0 if made.metric else None,
         notes=(*made.report, *info.notes),
-        reference=_describe(path, prepared, made, method, info, templates),
+        reference=describe_reference(path, prepared, made, method, info, templates),
     )
     if out is not None:
         save(out, templates, info)
@@ -257,7 +257,7 @@ def _print_progress(stage: str, share: float) -> None:
     print(f"\rreconstructing: {stage} {share:.0%}  ", end="\n" if share >= 1 else "", flush=True)
 
 
-def _describe(
+def describe_reference(
     path: Path | None,
     prepared: PreparedPhoto,
     made: Reconstruction,
@@ -265,6 +265,7 @@ def _describe(
     info: ObjectInfo,
     templates: Templates,
 ) -> Reference | None:
+    """The photo and its camera as the object file keeps them; None where the camera is not known."""
     import cv2
 
     if made.camera_from_mesh is None or made.camera is None:

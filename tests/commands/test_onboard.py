@@ -59,3 +59,45 @@ def test_a_mesh_becomes_an_object_file(case, capfd, monkeypatch):
     assert (
         "--set: resolution: a whole number from 1 is expected, for instance 56, not 'large'" in capfd.readouterr().err
     )
+
+
+def test_a_mesh_with_its_photo_says_how_well_they_fit(case, capfd, monkeypatch):
+    import cv2
+    import numpy as np
+
+    from ipjax.files.meshes.mesh import make_mesh
+    from ipjax.files.meshes.saving import save_mesh
+    from ipjax.synthetic import problems
+
+    monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: problems.make_encoder())
+    ball, whole = trimesh.creation.icosphere(3), problems.make_frame(5)
+    points = np.asarray(ball.vertices)
+    save_mesh(make_mesh(points * problems.AXES, ball.faces, colours=0.5 + 0.45 * points), case / "egg.ply")
+    cv2.imwrite(str(case / "photo.png"), whole.rgb[..., ::-1])
+    cv2.imwrite(str(case / "outline.png"), 255 * whole.mask.astype(np.uint8))
+    K = whole.matrix
+    words = ["onboard", case / "egg.ply", "-o", case / "egg.ipjax", "--directions", 20, "--rolls", 6]
+    words += ["--backend", "raster"]
+    for change in ("resolution=112", "surface=512", "appearance=2000"):
+        words += ["--set", change]
+    alone = [*map(str, words), "--json"]
+    beside = ["--photo", str(case / "photo.png"), "--mask", str(case / "outline.png")]
+    beside += ["--photo-camera", f"{K[0, 0]},{K[1, 1]},{K[0, 2]},{K[1, 2]}"]
+    assert run([*alone, *beside]) == 0
+    told = json.loads(capfd.readouterr().out)
+    assert any("camera was found relative to the mesh" in note for note in told["notes"])
+    templates, info = load(case / "egg.ipjax")
+    assert templates.photo_centre is not None and info.reference.file == "photo.png" and info.reference.camera_given
+    assert 0.2 < info.reference.seen < 0.5
+    # What belongs to no mesh, or to no photo beside one, is still refused.
+    for more, message in (
+        (["--mask", str(case / "outline.png")], "--mask does not belong to a mesh"),
+        (["--photo-camera", "1,1,1,1"], "--photo-camera belongs to --photo"),
+        ([*beside, "--depth", str(case / "outline.png")], "--depth does not belong to a mesh"),
+        (["--photo", str(case / "none.png")], "no such photo"),
+    ):
+        assert run([*alone, *more]) == 2
+        assert message in capfd.readouterr().err
+    photo = ["onboard", str(case / "photo.png"), "-o", str(case / "egg.ipjax"), *beside[:2]]
+    assert run(photo) == 2
+    assert "--photo does not belong to a photo" in capfd.readouterr().err

@@ -12,6 +12,7 @@ mesh, and a checksum. Tensors, for v templates of p patches with c channels, and
     mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
     pictures u8 [bytes] · pictures.end i64 [v]                                       optional, one JPEG per template
     photo u8 [bytes]                                                                 optional, JPEG of the reference
+    photo_centre f32 [3]                                             optional, of a mesh that was made from it elsewhere
     reference.rgb u8 [s s 3] · reference.depth f32 [s s] · reference.mask bool [s s] optional, to find poses through
     reference.features f16 [q f] · reference.points f32 [q 3] · reference.grid f32 [q 2] · reference.valid bool [q]
     reference.rotation f32 [3 3] · reference.translation f32 [3] · reference.focal, reference.centre f32 [2]
@@ -24,7 +25,7 @@ whether that depth was measured or guessed. ``photo`` is there for people, with 
 saved after ``ipjax.compact`` have fewer patches than the photo, which keeps all of its own.
 
 Format 1 had no ``reference.`` tensors; its files are read as they are, and have no reference view. Format 2 had them of
-photos without depth only, and no ``depth_measured``.
+photos without depth only, and no ``depth_measured``. Neither had ``photo_centre``.
 """
 
 import hashlib
@@ -66,6 +67,7 @@ OPTIONAL_TENSORS = {
     "pictures": ("uint8", "j"),
     "pictures.end": ("int64", "v"),
     "photo": ("uint8", "i"),
+    "photo_centre": ("float32", "3"),
     "reference.rgb": ("uint8", "ss3"),
     "reference.depth": ("float32", "ss"),
     "reference.mask": ("bool", "ss"),

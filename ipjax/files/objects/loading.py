@@ -71,6 +71,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
             basis=jnp.asarray(tensors["basis"]) if "basis" in tensors else None,
             appearance=_make_appearance(tensors),
             reference=_make_reference_view(tensors, made_by, measured=header.get("depth_measured") is True),
+            photo_centre=jnp.asarray(tensors["photo_centre"]) if "photo_centre" in tensors else None,
         ),
         info,
     )

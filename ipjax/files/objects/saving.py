@@ -56,6 +56,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
             "appearance.normals": templates.appearance.normals,
             "appearance.colours": _to_bytes("appearance.colours", templates.appearance.colours),
         }
+    if templates.photo_centre is not None:
+        tensors["photo_centre"] = templates.photo_centre
     if templates.reference is not None:
         tensors |= _flatten_reference(templates.reference)
     if np.ndim(patches.features) != 3:

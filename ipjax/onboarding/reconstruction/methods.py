@@ -26,6 +26,7 @@ class Method:
 
 METHODS = {  # by the name that an object file keeps
     "depth": Method("its front measured by the depth image, its back guessed"),
+    "elsewhere": Method("a mesh made elsewhere, with the photo that it was made from", keeps_camera=True),
     "inflate": Method("its outline inflated without learned weights"),
     "triposr": Method("reconstructed by TripoSR", "TripoSR", "MIT", keeps_camera=False),
 }

@@ -98,6 +98,8 @@ def _describe_source(info: ObjectInfo) -> str:
     if info.reference is None:
         return f"made from {source}"
     method = METHODS.get(info.reference.method)
+    if info.reference.method == "elsewhere":
+        return f"made from {source}, {METHODS['elsewhere'].description}, {info.reference.file or 'in memory'}"
     return f"made from one photo, {source}: {method.description if method else info.reference.method}"
 
 

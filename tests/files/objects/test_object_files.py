@@ -132,7 +132,7 @@ def test_files_of_format_1_are_read(file):
     found, _ = load(file)
     jax.tree.map(np.testing.assert_array_equal, wanted, found)
     assert found.reference is None
-    assert check(file) == [line.replace("format 3", "format 1") for line in told]
+    assert check(file) == [line.replace(f"format {FORMAT}", "format 1") for line in told]
 
 
 @pytest.mark.parametrize(
