@@ -81,8 +81,8 @@ class ScoreConfig(eqx.Module):
     depth_power: float = 0.5  # of the depth agreement of a drawn candidate
     colour_weight: float = 0.5  # a drawn candidate's score is multiplied by exp(this · (correlation − 1))
     guess: float = 0.5  # agreement in features assumed of surface that is guessed, for drawn candidates
-    # The share by which that replaces what surface shows that an image-to-3D model invented. At 1 right poses of made
-    # objects were lost (``python -m benchmarks.reconstructions made``): what was invented often looks right.
+    # The share by which that replaces what surface shows that an image-to-3D model invented. Of made objects more
+    # right poses were lost the more it was (``python -m benchmarks.reconstructions made``): it often looks right.
     invented: float = 0.0
     apart: float = 0.09  # candidates closer than this angle (rad) and 0.03 diameters count as one
     alternates: int = _static(2)  # best hypotheses that are also tried turned by 90° and 180° about the box's axes
@@ -119,9 +119,9 @@ class ConfidenceConfig(eqx.Module):
     drawn: tuple[float, ...] = (2.04, 0.94, 1.15, 2.37, 5.92, 0.0, -2.04)  # see ``confidence.probability``
     undrawn: tuple[float, ...] = (7.84, 1.51, 6.84, 0.0, 0.0, 1.23, -3.77)  # where no candidate was drawn
     photo: tuple[float, ...] = (6.7, 0.0, 2.59, 1.95, 7.69, 0.0, -4.81)  # of objects from a photo without depth
-    # By how much the logit falls where an image-to-3D model invented all that is in view: the most that took no right
-    # pose of made objects below ``least``.
-    invented: float = 1.5
+    # By how much the logit falls where an image-to-3D model invented all that is in view: the least at which no wrong
+    # pose of made objects was called present (``python -m benchmarks.reconstructions made``).
+    invented: float = 1.0
     least: float = 0.5  # confidence below which ``present`` is False
     independent: float = 9.84  # number of independent residuals of refinement
     pair_share: float = 0.0239  # share of the pairs that are independent

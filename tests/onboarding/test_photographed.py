@@ -133,6 +133,7 @@ def test_a_pose_that_rests_on_what_was_invented_is_less_sure():
         fallen.append(logit(sure) - logit(found))
         wanted = float(TINY.confidence.invented) * (1 - float(found.agreement.seen))
         assert fallen[-1] == pytest.approx(wanted, abs=0.01)
-    assert fallen[0] < 0.7 < 1.0 < fallen[1]  # from the photo's side, and from behind
+    # From the photo's side, and from behind.
+    assert fallen[0] < 0.45 * float(TINY.confidence.invented) and fallen[1] > 0.7 * float(TINY.confidence.invented)
     doubted = estimate(templates, query, jax.random.key(0), eqx.tree_at(lambda c: c.score.invented, TINY, 1.0))
     assert np.abs(np.asarray(doubted.hypotheses.score) - np.asarray(found.hypotheses.score)).max() > 1e-3
