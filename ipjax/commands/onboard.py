@@ -50,7 +50,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--report", type=Path, metavar="HTML", help="a page of what was made; needs nothing beside it")
     parser.add_argument("--name", help="of the object (default: the file's)")
     parser.add_argument("--unit", choices=tuple(UNITS), help="of the mesh file, if known; never guessed")
-    options.add_views(parser, "the sphere")
+    options.add_views(parser, "the sphere, of meshes and photos with depth")
     parser.add_argument("--channels", type=parse_count, metavar="N", help="cut features to N principal directions")
     options.add_changes(parser, "OnboardConfig", "surface=4096")
     parser.add_argument("--backend", default="auto", help="renderer: auto, egl, osmesa, native or raster")
@@ -58,7 +58,9 @@ def add(commands: Any) -> None:
     options.add_reporting(parser, quiet="no progress bars, no notes")
     photo = parser.add_argument_group("photos")
     options.add_mask(
-        photo, "the object (default: transparency, plain background)", "cut the object out inside this box, pixels"
+        photo,
+        "the object (default: transparency, a plain background, or rembg where it is installed)",
+        "cut the object out inside this box, pixels",
     )
     photo.add_argument("--click", type=parse_numbers, metavar="X,Y", help="cut out the object at this pixel")
     options.add_depth(photo, "depth aligned to the photo: metric front and size")
@@ -146,6 +148,11 @@ def _check(arguments: argparse.Namespace) -> bool:
         if getattr(arguments, name) is not None:
             other = "a mesh" if not is_photo else "a photo"
             raise ValueError(f"{source}: --{name.replace('_', '-')} does not belong to {other}")
+    for name in ("directions", "rolls") if is_photo and arguments.depth is None else ():
+        if getattr(arguments, name) is not None:
+            raise ValueError(
+                f"{source}: --{name} does not belong to a photo without depth, whose views are the photo's own"
+            )
     if arguments.report is not None:
         options.check_output(arguments.report, (".html", ".htm"))
     if arguments.save_mesh is not None:

@@ -117,7 +117,8 @@ def make_templates(
       The templates, and their images ``[v resolution resolution 3]`` uint8 for pictures.
 
     Raises:
-      ValueError: more ``config.channels`` than the encoder's features have, said before anything takes time.
+      ValueError: more ``config.channels`` than the encoder's features have, said before anything takes time; or a photo
+        none of whose patches is object enough.
     """
     if config.channels:
         image = jax.ShapeDtypeStruct((config.resolution, config.resolution, 3), jnp.float32)
@@ -162,6 +163,11 @@ def make_templates(
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     raw = jax.tree.map(lambda *x: jnp.stack(x), *patches)
+    if photo is not None and not bool(jnp.any(raw.valid[0])):
+        raise ValueError(
+            f"the object is too thin: in the photo, reduced to {config.resolution} pixels around it, it fills "
+            f"{config.describe.cover:.0%} of no patch"
+        )
     patches, mean, norm = jax.jit(centre)(raw)
     if photo is not None:
         # The mean of the photo itself: the drawings from beside show its colours, not all of what an encoder sees.

@@ -186,6 +186,15 @@ def test_bad_shots_are_refused_in_words(case):
         photos.prepare_photo(Photo(rgb), **given)
 
 
+def test_a_photo_that_shows_no_patch_is_refused(encoder):
+    """Poses are found through its patches: of a wire none is covered, and no object could be found."""
+    rgb, *_ = ball()
+    wire = np.zeros((HEIGHT, WIDTH), bool)
+    wire[58:63, 5:155] = True
+    with pytest.raises(ValueError, match="too thin"):
+        photos.onboard_photo(Photo(rgb), encoder, CONFIG, mask=wire, camera=K, lrm="inflate", progress=False)
+
+
 def test_triposr_without_weights_is_refused_but_auto_goes_on(encoder, monkeypatch, tmp_path):
     monkeypatch.setenv("IPJAX_CACHE", str(tmp_path))
     monkeypatch.delenv("IPJAX_TRIPOSR", raising=False)
@@ -252,6 +261,7 @@ def test_thin_and_textureless_objects_are_warned_of(metric):
     [
         (("none.jpg",), "no such photo"),
         (("p.png", "--unit", "mm"), "--unit does not belong to a photo"),
+        (("p.png", "--rolls", "2"), "--rolls does not belong to a photo without depth"),
         (("m.ply", "--mask", "p.png"), "--mask does not belong to a mesh"),
         (("p.png", "--box", "1,x"), "is no box"),
         (("p.png", "--report", "r.pdf"), "must end in .html"),
@@ -280,7 +290,7 @@ def test_a_photo_goes_through_the_command(encoder, monkeypatch, tmp_path, capsys
     rgb, mask, _ = ball()
     Image.fromarray(np.dstack([rgb, np.uint8(255) * mask.astype(np.uint8)])).save(tmp_path / "ball.png")
     out, mesh = tmp_path / "ball.ipjax", tmp_path / "ball.glb"
-    words = ["onboard", tmp_path / "ball.png", "-o", out, "--save-mesh", mesh, "--directions", 2, "--rolls", 1]
+    words = ["onboard", tmp_path / "ball.png", "-o", out, "--save-mesh", mesh]
     assert cli.main([str(w) for w in words]) == 0
     told = capsys.readouterr().out
     assert "diameter unknown" in told and "made without learned weights" in told

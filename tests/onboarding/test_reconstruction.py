@@ -96,7 +96,16 @@ def test_inflation_of_a_photo():
     half = len(made.mesh.vertices) // 2
     np.testing.assert_array_equal(made.mesh.uv[:half], made.mesh.uv[half:])
     assert made.mesh.seen[half:].max() == 0
-    assert any("assumed" in line for line in inflate_photo(rgb, mask).report)
+    assert any("guessed (± 35%)" in line for line in inflate_photo(rgb, mask).report)
+
+
+@pytest.mark.parametrize("focal", [230.0, 80.0, 30.0])
+def test_what_is_seen_from_very_near_is_inflated_before_the_camera(focal):
+    """A wide angle sees an outline whose half depth is more than its distance; the front still has its pixels."""
+    rgb, mask, _ = _ball()
+    made = inflate_photo(rgb, mask, camera=Camera(jnp.full(2, focal), CAMERA.centre))
+    _check(made, rgb, mask)
+    assert _project(made, made.mesh.vertices)[1][:, 2].min() > 0.1
 
 
 @pytest.mark.parametrize("back", ["inflate", "mirror", "auto"])

@@ -275,8 +275,8 @@ def compare_drawings(
 
     def step(index, state):
         turns, shifts, first, best = state
-        order = lax.top_k(first, polished)[1]
-        one = jnp.where(index < count, index, order[(index - count) % polished])
+        order = lax.top_k(first, max(polished, 1))[1]
+        one = jnp.where(index < count, index, order[(index - count) % max(polished, 1)])
         drawn = draw(turns[one], shifts[one])
         score = drawn.overlap * root(drawn.contained) * agreed[one]
         score = jnp.where(found.support[one] >= 0, score, -1)

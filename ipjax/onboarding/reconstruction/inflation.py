@@ -45,12 +45,21 @@ def inflate_photo(
     half = bulge(outline.inside, roundness) * outline.step / focal.mean()
     half = np.maximum(half, 0.1 * outline.step / focal.mean())
     rays = np.concatenate([(outline.pixels - centre) / focal, np.ones((*half.shape, 1))], axis=-1)
-    front = rays * (1.0 - half[..., None])
+    front = rays * _front_depth(half)[..., None]
     back = front * [1.0, 1.0, 0.0] + (1.0 + half[..., None]) * [0.0, 0.0, 1.0]
     seen = np.ones(half.shape)
     return join_sheets(
         outline, front, back, outline.pixels, seen, rgb, mask, (focal, centre), metric=False, report=report
     )
+
+
+def _front_depth(half: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
+    """Depth of the front, the plane being at 1: nearer by the half depth, but never behind the camera.
+
+    Of what is seen from very near the outline alone would reach past it: beyond half the way it only comes nearer,
+    smoothly.
+    """
+    return np.where(half < 0.5, 1.0 - half, 0.25 / np.maximum(half, 0.5))
 
 
 def bulge(inside: Bool[np.ndarray, "r c"], roundness: float = ROUNDNESS) -> Float[np.ndarray, "r c"]:

@@ -161,6 +161,15 @@ def test_the_paper_knows_no_photo():
     assert found.hypotheses.score.shape == (1,)
 
 
+def test_drawings_may_be_compared_only():
+    """No candidate is refined on what its drawing matches: no rounds, or none in them."""
+    templates, query = known()
+    bare = [dataclasses.replace(CONFIG.resect, **one) for one in ({"polished": 0}, {"rounds": 0})]
+    none, also_none = (run(templates, query, config=dataclasses.replace(CONFIG, resect=one)) for one in bare)
+    assert bool(none.success)
+    assert_same(none, also_none)
+
+
 def test_fast_draws_fewer():
     templates, query = known()
     told = jax.eval_shape(lambda: ipjax.estimate(encoder, templates, query, jax.random.key(0), Config.fast()))
