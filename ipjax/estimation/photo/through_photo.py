@@ -31,6 +31,8 @@ from ipjax.estimation.scene import SceneGrid
 from ipjax.estimation.scoring import closeness, depth_agreement
 from ipjax.records import Agreement, Hypotheses, PoseEstimate, Query, ReferenceView, Similarity, Templates
 
+TIMES = 5.0  # by which a given size may differ from that of the guessed shape
+
 
 def estimate_through_photo(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]] | None,
@@ -87,6 +89,8 @@ def estimate_through_photo(
         if diameter is not None:
             # The front is where it was measured; of the given size, the rest is nearer or farther.
             behind = (units - diameter) * front
+            # A guessed shape may be several times as long as the object is, but not any number of times.
+            score = jnp.where((units < TIMES * diameter) & (diameter < TIMES * units), score, -1)
             units = jnp.full_like(units, diameter)
         poses = jax.vmap(lambda *one: query_from_object(reference, *one))(*camera, units, behind)
     order = lax.top_k(score, score.shape[0])[1]

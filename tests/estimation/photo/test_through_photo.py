@@ -270,6 +270,17 @@ def test_an_answer_from_nothing_says_so(used):
         assert may or float(found.confidence) == 0, name
 
 
+def test_a_size_that_no_such_object_has_is_no_success():
+    """Five times the size that was found, either way; half of it is what a badly guessed shape may need."""
+    templates, query = known()
+    size = run(templates, query).camera_from_object.scale
+    for times, may in ((0.5, True), (2.0, True), (6.0, False), (1e9, False), (0.1, False), (1e-9, False)):
+        found = run(templates, query, diameter=times * size)
+        assert_finite(found)
+        assert bool(found.success) == may, times
+        assert may or (float(found.confidence) == 0 and not bool(found.present))
+
+
 @jax.jit
 def slopes(templates, query, share):
     """Of the confidence and a share of everything else that an estimate says, by every number of its records."""
