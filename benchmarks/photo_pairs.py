@@ -283,13 +283,13 @@ def states(rows: list[dict]) -> str:
     return ", ".join(dict.fromkeys(row.get("commit", "unknown") for row in rows))
 
 
-def write_page(path: Path, text: str, measured: str) -> None:
+def write_page(path: Path, text: str, rows: list[dict]) -> None:
     """The tables with what they rest on."""
     from benchmarks.measure import describe_device
 
     device = describe_device()
     head = [
-        "# Objects from one photo",
+        "# Objects from one photo" + (" without depth" if {row["key"][0] for row in rows} == {"rgb"} else ""),
         "",
         "Made by `python -m benchmarks.photo_pairs`; do not edit by hand. Each object is made from one masked photo "
         "(`rgb`: its outline inflated, size unknown; `rgbd`: its depth completed, size known) or from the true mesh "
@@ -299,7 +299,7 @@ def write_page(path: Path, text: str, measured: str) -> None:
         "MSSD and MSPD recalls are means over BOP's ten thresholds.",
         "",
         f"{device['device']}, {device['cores']} cores, jax {device['jax']}, Python {device['python']}, "
-        f"commit {measured}.",
+        f"commit {states(rows)}.",
     ]
     write_text(path, "\n".join(head) + "\n\n" + text + "\n", parents=True)
 
@@ -336,7 +336,7 @@ def main() -> None:
         text = "\n\n".join(f"## {path.stem}\n\n{table(rows[path])}" for path in options.results)
         print(text)
         if options.page:
-            write_page(options.page, text, states(list(itertools.chain(*rows.values()))))
+            write_page(options.page, text, list(itertools.chain(*rows.values())))
         return
     from ipjax.config import OnboardConfig
 
