@@ -18,7 +18,7 @@ from ipjax_kernels.perspective import refine_resection
 from jaxtyping import Array, Bool, Float, UInt8
 from scipy import ndimage, optimize
 
-from ipjax.cameras import look_at, middle, unproject
+from ipjax.cameras import look_at, middle, resize, unproject
 from ipjax.config import DescribeConfig, MatchConfig, ResectConfig, ScoreConfig
 from ipjax.estimation.features import describe, object_features
 from ipjax.estimation.matching import match, select
@@ -282,8 +282,7 @@ def _fit_outline(
     side = crop.mask.shape[0]
     points = sample_appearance(mesh, POINTS)[0]
     zoom = SIDE / side
-    lens = np.diag([zoom, zoom, 1.0]) @ crop.matrix
-    lens[:2, 2] = zoom * (crop.matrix[:2, 2] + 0.5) - 0.5
+    lens = resize(crop.matrix, (side, side), (SIDE, SIDE))
     cover = ndimage.zoom(crop.mask.astype(np.float32), zoom, order=1, grid_mode=True, mode="nearest")
     photo = np.asarray(cover > 0.5)
     border = lambda shape: shape & np.logical_not(ndimage.binary_erosion(shape))

@@ -96,6 +96,39 @@ def _fill_holes(image: Float[Array, "h w c"], depth: Float[Array, "h w"]) -> tup
     return jnp.where(hole[..., None], filled[..., :-1], image), jnp.where(hole, filled[..., -1], depth)
 
 
+class _Described(eqx.Module):
+    """A drawing of the query, patch by patch."""
+
+    features: Float[Array, "p c"]  # centred as the templates' are
+    points: Float[Array, "p 3"]  # mean place of what is drawn there: metres, the query's camera
+    colours: Float[Array, "p 3"]  # mean of what is drawn there
+    cover: Float[Array, " p"]  # share of the patch that is drawn
+    grid: tuple[int, int] = eqx.field(static=True)  # rows and columns of patches
+
+
+def _describe(
+    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
+    templates: Templates,
+    image: Float[Array, "h w 6"],
+    depth: Float[Array, "h w"],
+) -> _Described:
+    """What the encoder makes of a drawing as `splat_query` returns it."""
+    shown = depth > 0
+    image = jnp.where(shown[..., None], image, 0)
+    features = object_features(encoder(image[..., :3]), templates)
+    rows, columns, channels = features.shape
+    cover = _patch_means(shown.astype(depth.dtype), rows, columns)[:, 0]
+    means = _patch_means(image, rows, columns) / jnp.maximum(cover, 1e-6)[:, None]
+    return _Described(features.reshape(-1, channels), means[:, 3:], means[:, :3], cover, (rows, columns))
+
+
+def _patch_means(image: Float[Array, "h w *c"], rows: int, columns: int) -> Float[Array, "p c"]:
+    """The mean of each patch."""
+    height, width = image.shape[:2]
+    parts = image.reshape(rows, height // rows, columns, width // columns, -1)
+    return jnp.mean(parts, axis=(1, 3)).reshape(rows * columns, -1)
+
+
 def look_from_beside(
     encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
     templates: Templates,
@@ -131,17 +164,11 @@ def look_from_beside(
     def look(turn):
         rotation = jnp.matmul(turn, towards, precision="highest")
         translation = jnp.zeros(3, dtype).at[2].set(distance) - jnp.matmul(rotation, middle, precision="highest")
-        image, depth = _splat(lens, size, query, rotation, translation, sight)
-        shown = depth > 0
-        features = object_features(encoder(jnp.where(shown[..., None], image[..., :3], 0)), templates)
-        rows, columns, channels = features.shape
-        cover = _patch_means(shown.astype(dtype), rows, columns)[:, 0]
-        where = _patch_means(jnp.where(shown[..., None], image[..., 3:], 0), rows, columns)
-        where = where / jnp.maximum(cover, 1e-6)[:, None]
-        valid = cover > config.cover
+        drawn = _describe(encoder, templates, *_splat(lens, size, query, rotation, translation, sight))
+        (rows, columns), where, valid = drawn.grid, drawn.points, drawn.cover > config.cover
         normals = grid_normals(where.reshape(rows, columns, 3), valid.reshape(rows, columns))
         grid = jnp.asarray(np.indices((rows, columns))[::-1].reshape(2, -1).T, dtype)
-        patches = Patches(features.reshape(-1, channels), where, grid, valid, query.patches.encoder)
+        patches = Patches(drawn.features, where, grid, valid, query.patches.encoder)
         return Look(patches, normals.reshape(-1, 3))
 
     return lax.map(look, turns)
@@ -167,13 +194,6 @@ def contained_share(
     measured = measured_surface(query)
     count = lambda x: jnp.sum(x, dtype=lens.focal.dtype)
     return count(measured & within) / jnp.maximum(count(measured), 1)
-
-
-def _patch_means(image: Float[Array, "h w *c"], rows: int, columns: int) -> Float[Array, "p c"]:
-    """The mean of each patch."""
-    height, width = image.shape[:2]
-    parts = image.reshape(rows, height // rows, columns, width // columns, -1)
-    return jnp.mean(parts, axis=(1, 3)).reshape(rows * columns, -1)
 
 
 class Drawing(eqx.Module):
@@ -202,13 +222,9 @@ def draw_query(
     reference = templates.reference
     assert reference is not None
     image, depth = splat_query(reference, query, rotation, translation, sight)
-    shown = depth > 0
-    features = object_features(encoder(jnp.where(shown[..., None], image[..., :3], 0)), templates)
-    rows, columns, channels = features.shape
-    features = features.reshape(-1, channels)
+    drawn = _describe(encoder, templates, image, depth)
+    (rows, columns), features, cover = drawn.grid, drawn.features, drawn.cover
     mean = lambda x: _patch_means(x, rows, columns)
-    cover = mean(shown.astype(depth.dtype))[:, 0]
-    where = mean(jnp.where(shown[..., None], image[..., 3:], 0)) / jnp.maximum(cover, 1e-6)[:, None]
     outline = mean(reference.view.mask.astype(depth.dtype))[:, 0]
     photo = jnp.where(reference.patches.valid[:, None], reference.patches.features, 0).astype(features.dtype)
     cosine = jnp.sum(features * photo, axis=-1)
@@ -218,23 +234,21 @@ def draw_query(
     grid = np.indices((rows, columns)).reshape(2, -1)
     apart = jnp.asarray(np.abs(grid[:, :, None] - grid[:, None]).max(axis=0), depth.dtype)
     alike = jnp.matmul(features, photo.T, precision="highest")
-    alike = jnp.where(reference.patches.valid[None], alike, -jnp.inf)
-    alike = jnp.where(apart <= config.window, alike, -jnp.inf)
+    alike = jnp.where((apart <= config.window) & reference.patches.valid[None], alike, -jnp.inf)
     best = jnp.max(alike, axis=1)
     found = jnp.isfinite(best)
     pull = jnp.where(jnp.isfinite(alike), jnp.exp((alike - jnp.where(found, best, 0)[:, None]) / config.softness), 0)
     pull = pull / jnp.maximum(jnp.sum(pull, axis=1, keepdims=True), 1)  # the best counts 1
     rays = jnp.matmul(pull, rays_of(reference, reference.patches.points), precision="highest")
     weight = jnp.where(found & (cover > config.cover), jnp.maximum(best, 0), 0)
-    drawn_colour = mean(jnp.where(shown[..., None], image[..., :3], 0)) / jnp.maximum(cover, 1e-6)[:, None]
     photo_colour = jnp.where(reference.view.mask[..., None], reference.view.rgb, 0)
     photo_colour = mean(photo_colour) / jnp.maximum(outline, 1e-6)[:, None]
     return Drawing(
         overlap=jnp.clip(overlap, 0, 1),
         contained=contained_share(reference, query, rotation, translation),
-        colour=chroma_correlation(drawn_colour, photo_colour, shared),
+        colour=chroma_correlation(drawn.colours, photo_colour, shared),
         shared=jnp.sum(shared) / jnp.maximum(jnp.sum(outline), 1e-6),
-        points=where,
+        points=drawn.points,
         rays=rays,
         weight=weight,
         depth=depth,

@@ -49,8 +49,8 @@ def find_focal(tags: Mapping[int, Any], size: tuple[int, int]) -> ExifFocal:
     density = _positive(tags, _PLANE_X)
     unit = _MILLIMETRES.get(int(_positive(tags, _PLANE_UNIT) or 2))
     longer, shorter = max(size), min(size)
-    written = _positive(tags, _WIDTH), _positive(tags, _HEIGHT)
-    made = (longer, shorter) if None in written else (max(written), min(written))  # type: ignore[type-var]
+    wide, high = _positive(tags, _WIDTH), _positive(tags, _HEIGHT)
+    made = (longer, shorter) if wide is None or high is None else (max(wide, high), min(wide, high))
     if not (on_film or (focal and density and unit)):
         silent = not any(name in tags for name in (_FOCAL, _FOCAL_ON_FILM))
         return ExifFocal(note="" if silent else "EXIF tells no focal length that can be had in pixels")

@@ -268,7 +268,7 @@ def _read_box(value: Any, corners: bool) -> Box | None:
 
 
 def _read_size(entry: dict, height: str, width: str) -> Size | None:
-    values = entry.get(height), entry.get(width)
-    if all(isinstance(value, int) and not isinstance(value, bool) and value > 0 for value in values):
-        return int(values[0]), int(values[1])  # type: ignore[arg-type]
-    return None
+    rows, columns = entry.get(height), entry.get(width)
+    if isinstance(rows, bool) or isinstance(columns, bool) or not isinstance(rows, int) or not isinstance(columns, int):
+        return None
+    return (rows, columns) if rows > 0 and columns > 0 else None
