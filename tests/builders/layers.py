@@ -24,6 +24,7 @@ ORDER = [
     ["ipjax.files"],
     ["ipjax.rendering"],
     ["ipjax.inference"],
+    ["ipjax.detection"],
     ["ipjax.onboarding"],
     ["ipjax.synthetic"],
     ["ipjax.bop"],
