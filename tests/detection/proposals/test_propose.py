@@ -7,7 +7,6 @@ from ipjax.detection.proposals.propose import ProposalConfig, propose, suppress
 from ipjax.records import Camera
 from ipjax.synthetic.objects import make_object
 from ipjax.synthetic.scenes import make_scene
-from ipjax.synthetic.sensor import PERFECT
 
 
 def best_overlaps(proposals, masks, first=20):
@@ -20,7 +19,7 @@ def iou(one, other):
 
 
 def table_frame(blocks, height=240, width=320, noise=0.001, seed=0):
-    """A grey table seen from above at a slant, and blocks on it: ((left, top, right, bottom), colour, metres of height).
+    """A grey table seen from above at a slant, and blocks: ((left, top, right, bottom), colour, metres of height).
 
     Returns rgb, depth, K and a mask for each block.
     """
