@@ -1,4 +1,4 @@
-"""A frame made ready for cutting it up: colour, depth without holes, normals, and how strong each border of pixels is."""
+"""A frame made ready for cutting it up: colour, depth without holes, normals, and the steps between pixels."""
 
 import dataclasses
 
