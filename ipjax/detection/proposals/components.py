@@ -50,3 +50,32 @@ def find_components(
                 grown = cv2.dilate(piece, kernel if erosion else np.ones((3, 3), np.uint8))
                 found.append(grown.view(bool) & off)
     return np.array(found, bool).reshape(-1, *off.shape)
+
+
+def find_basins(
+    surfaces: Surfaces, levels: Sequence[float] = (0.15, 0.3, 0.5), least: int = 30
+) -> Bool[np.ndarray, "n h w"]:
+    """Regions that steps of depth and concave creases close in, grown until they meet on the steps' crests.
+
+    Args:
+      surfaces: the frame.
+      levels: of the steps (1 = a jump by 3 % or a crease of about 50°); what is below is one region where it connects.
+      least: pixels below which a region is dropped.
+    """
+    from skimage.segmentation import watershed
+
+    height = np.zeros(surfaces.shape, np.float32)
+    for jump, crease, (rows, columns) in zip(surfaces.jump, surfaces.crease, ((0, 1), (1, 0)), strict=True):
+        step = np.maximum(jump / 0.03, crease / 0.4).astype(np.float32)
+        before = height[: height.shape[0] - rows, : height.shape[1] - columns]
+        np.maximum(before, step, out=before)
+        np.maximum(height[rows:, columns:], step, out=height[rows:, columns:])
+    found = []
+    for level in levels:
+        count, labels, stats, _ = cv2.connectedComponentsWithStats((height < level).view(np.uint8), connectivity=4)
+        labels[stats[labels, cv2.CC_STAT_AREA] < least // 3] = 0
+        grown = watershed(height, labels)
+        for label in np.flatnonzero(np.bincount(grown.reshape(-1), minlength=count) >= least):
+            if label and stats[label, cv2.CC_STAT_AREA] >= least // 3:
+                found.append(grown == label)
+    return np.array(found, bool).reshape(-1, *surfaces.shape)

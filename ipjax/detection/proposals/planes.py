@@ -1,5 +1,6 @@
 """Large planes of a frame: tables, floors and walls, on which things stand and before which they are seen."""
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -7,6 +8,7 @@ from ipjax.detection.proposals.surfaces import Surfaces
 
 _TRIALS = 300  # planes through three points
 _JUDGES = 2500  # points that they are judged by
+_ALIKE = 0.85  # cosine between the normal at a point and that of its plane
 
 
 def find_planes(
@@ -27,6 +29,7 @@ def find_planes(
     """
     rng = np.random.default_rng(seed)
     points = surfaces.points.reshape(-1, 3).astype(np.float64)
+    normals = surfaces.normals.reshape(-1, 3)
     allowed = tolerance * points[:, 2] ** 1.5
     free = surfaces.known.reshape(-1).copy()
     found = []
@@ -34,37 +37,45 @@ def find_planes(
         left = np.flatnonzero(free)
         if left.size < max(least_share * free.size, 50):
             break
-        plane = _find_plane(rng, points, allowed, left)
+        plane = _find_plane(rng, points, normals, allowed, left)
         if plane is None:
             break
         for _ in range(3):  # fitted to what it holds
-            inside = left[np.abs(points[left] @ plane[:3] + plane[3]) < allowed[left]]
+            inside = left[_lies_on(plane, points[left], normals[left], allowed[left])]
             if inside.size < 3:
                 break
             plane = _fit(points[inside], allowed[inside])
-        distance = np.abs(points @ plane[:3] + plane[3])
-        on = (distance < allowed) & surfaces.trusted.reshape(-1)
+        on = _lies_on(plane, points, normals, allowed) & surfaces.trusted.reshape(-1)
         if (on & free).sum() < least_share * free.size:
             break
-        found.append((on.reshape(surfaces.shape), plane))
+        # Normals beside an edge are those of both sides; what lies on the plane between others that do does, too.
+        near = np.abs(points @ plane[:3] + plane[3]) < allowed
+        closed = cv2.morphologyEx(on.reshape(surfaces.shape).view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        found.append((closed.view(bool) & near.reshape(surfaces.shape), plane))
         free &= ~on
     return found
 
 
-def _find_plane(rng, points, allowed, left) -> np.ndarray | None:
+def _lies_on(plane, points, normals, allowed) -> np.ndarray:
+    """A slice through things has points near it, too, but not with its normal."""
+    return (np.abs(points @ plane[:3] + plane[3]) < allowed) & (np.abs(normals @ plane[:3]) > _ALIKE)
+
+
+def _find_plane(rng, points, normals, allowed, left) -> np.ndarray | None:
     """The plane through three of the points that most of the others lie on."""
     three = points[rng.choice(left, (_TRIALS, 3))]
-    normals = np.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
-    length = np.linalg.norm(normals, axis=-1)
+    across = np.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
+    length = np.linalg.norm(across, axis=-1)
     good = length > 1e-8
     if not good.any():
         return None
-    normals = normals[good] / length[good, None]
-    offset = -(normals * three[good, 0]).sum(-1)
+    across = across[good] / length[good, None]
+    offset = -(across * three[good, 0]).sum(-1)
     judges = rng.choice(left, min(_JUDGES, left.size), replace=False)
-    near = np.abs(points[judges] @ normals.T + offset) < allowed[judges, None]
+    near = np.abs(points[judges] @ across.T + offset) < allowed[judges, None]
+    near &= np.abs(normals[judges] @ across.T) > _ALIKE
     best = near.sum(0).argmax()
-    return np.append(normals[best], offset[best])
+    return np.append(across[best], offset[best])
 
 
 def _fit(points: np.ndarray, allowed: np.ndarray) -> np.ndarray:

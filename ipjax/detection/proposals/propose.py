@@ -7,12 +7,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ipjax.detection.proposals.components import find_components
-from ipjax.detection.proposals.objectness import border_strength, judge, measure_masks, measure_regions
-from ipjax.detection.proposals.planes import find_planes
-from ipjax.detection.proposals.segments import make_segments, sum_over_pairs
-from ipjax.detection.proposals.surfaces import Surfaces, make_surfaces
-from ipjax.detection.proposals.trees import AFFINITIES, grow_tree
+from ipjax.detection.proposals.candidates import Candidates, Cutting, make_candidates
+from ipjax.detection.proposals.objectness import count_votes, judge
+from ipjax.detection.proposals.surfaces import make_surfaces
 from ipjax.files.cameras.reading import as_intrinsics
 
 
@@ -21,14 +18,10 @@ class ProposalConfig:
     """Settings of `propose`."""
 
     most: int = 64  # proposals that are kept
-    side: int = 320  # pixels of the longer side that the image is cut up at
-    segments: int = 500
-    compactness: float = 0.12  # of the segments
+    cuttings: tuple[Cutting, ...] = (Cutting(), Cutting(side=640, segments=1200, least=0.0004, largest=0.02, most=400))
     planes: int = 3  # sought at most
     plane_tolerance: float = 0.008  # metres at 1 m; grows with z^1.5
     plane_share: float = 0.05  # of the image that a plane covers at least
-    least: float = 0.0012  # share of the image that a proposal covers at least
-    largest: float = 0.25  # and at most
     overlap: float = 0.7  # IoU from which the lesser of two proposals is dropped
     seed: int = 0
 
@@ -58,46 +51,46 @@ def propose(rgb: Any, depth: Any, camera: Any, config: ProposalConfig | None = N
     """
     config = ProposalConfig() if config is None else config
     rgb, depth, matrix = _check(rgb, depth, camera, config)
+    made = make_all(rgb, depth, matrix, config)
+    masks, objectness, owner = pool(made)
     height, width = depth.shape
-    scale = min(config.side / max(height, width), 1.0)
-    small = max(round(width * scale), 16), max(round(height * scale), 16)
-    surfaces = make_surfaces(rgb, depth, matrix, *small)
-    masks, objectness = _make_masks(surfaces, config)
     kept = suppress(masks, objectness, config.overlap, config.most)
     large = np.zeros((len(kept), height, width), bool)
     for index, number in enumerate(kept):
-        large[index] = enlarge(masks[number], width, height)
+        which, row = owner[number]
+        large[index] = enlarge(made[which].mask(row), width, height)
     return Proposals(large, objectness[kept])
 
 
-def _make_masks(surfaces: Surfaces, config: ProposalConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Every proposal at the frame's working size, with its objectness."""
-    planes = find_planes(surfaces, config.planes, config.plane_tolerance, config.plane_share, config.seed)
-    on = np.zeros(surfaces.shape, bool)
-    for pixels, _ in planes:
-        on |= pixels
-    segments = make_segments(surfaces, config.segments, config.compactness)
-    labels = segments.labels
-    border = {
-        "jump": sum_over_pairs(labels, surfaces.jump),
-        "crease": sum_over_pairs(labels, surfaces.crease),
-        "contrast": sum_over_pairs(labels, surfaces.contrast),
-    }
-    on_plane = np.bincount(labels.reshape(-1), on.reshape(-1)) > 0.5 * segments.area
-    trees = [np.eye(len(segments.area), dtype=bool)]
-    for affinity in AFFINITIES:
-        trees += [grow_tree(segments, border, affinity, barred, config.largest) for barred in (None, on_plane)]
-    members = np.concatenate(trees)
-    share = members @ segments.area / labels.size
-    members = np.unique(members[(share >= config.least) & (share <= config.largest)], axis=0)
-    pieces = find_components(surfaces, ~on & surfaces.trusted)
-    share = pieces.mean((1, 2))
-    pieces = pieces[(share >= config.least) & (share <= config.largest)]
-    strength = border_strength(surfaces)
-    objectness = np.concatenate(
-        [judge(measure_regions(members, segments, strength)), judge(measure_masks(pieces, strength))]
-    )
-    return np.concatenate([members[:, labels], pieces]), objectness
+def make_all(rgb: np.ndarray, depth: np.ndarray, matrix: np.ndarray, config: ProposalConfig) -> list[Candidates]:
+    """The candidates of every resolution; no resolution is used that exceeds the image's, except the first."""
+    height, width = depth.shape
+    longer = max(height, width)
+    made = []
+    for index, cutting in enumerate(config.cuttings):
+        if index and longer <= config.cuttings[index - 1].side:
+            break
+        scale = min(cutting.side / longer, 1.0)
+        small = max(round(width * scale), 16), max(round(height * scale), 16)
+        surfaces = make_surfaces(rgb, depth, matrix, *small)
+        made.append(make_candidates(surfaces, cutting, config.planes, config.plane_tolerance, config.plane_share, config.seed))
+    return made
+
+
+def pool(made: list[Candidates]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All masks at the first one's resolution, their objectness, and whose they are: (resolution, number)."""
+    height, width = made[0].labels.shape
+    masks = np.concatenate([one.sample(width, height) for one in made])
+    step = max(round(max(height, width) / 80), 1)
+    coarse = masks[:, step // 2 :: step, step // 2 :: step].reshape(len(masks), -1)
+    ways = np.concatenate([one.ways for one in made])
+    votes = count_votes(coarse, ways)
+    begin = np.cumsum([0] + [len(one.ways) for one in made])
+    objectness = [
+        judge(dataclasses.replace(one.measures, votes=votes[a:b])) for one, a, b in zip(made, begin[:-1], begin[1:], strict=True)
+    ]
+    owner = np.concatenate([np.stack([np.full(len(one.ways), k), np.arange(len(one.ways))], -1) for k, one in enumerate(made)])
+    return masks, np.concatenate(objectness), owner
 
 
 def suppress(
@@ -105,7 +98,7 @@ def suppress(
 ) -> np.ndarray:
     """The numbers of the best masks, best first, of which no two overlap by more than an IoU of ``overlap``."""
     packed = np.packbits(masks.reshape(len(masks), -1), axis=1)
-    packed = np.pad(packed, ((0, 0), (0, -packed.shape[1] % 8))).view(np.uint64)
+    packed = np.ascontiguousarray(np.pad(packed, ((0, 0), (0, -packed.shape[1] % 8)))).view(np.uint64)
     order = np.argsort(-objectness, kind="stable")
     packed, area = packed[order], masks.sum((1, 2))[order]
     alive, kept = np.ones(len(order), bool), []
@@ -139,10 +132,13 @@ def _check(rgb: Any, depth: Any, camera: Any, config: ProposalConfig) -> tuple[n
         raise ValueError(f"depth must be metres as floats, not {depth.dtype}")
     if min(depth.shape) < 16:
         raise ValueError(f"an image of {shown(depth)} is too small for proposals: 16 pixels at least on a side")
-    if config.most < 1 or config.side < 32 or config.segments < 2:
-        raise ValueError("most must be at least 1, side at least 32 and segments at least 2")
-    if not 0 < config.least < config.largest <= 1:
-        raise ValueError(f"least and largest must be shares, the smaller first: {config.least:g}, {config.largest:g}")
+    if config.most < 1 or not config.cuttings:
+        raise ValueError("most must be at least 1, and cuttings name at least one resolution")
+    for cutting in config.cuttings:
+        if cutting.side < 32 or cutting.segments < 2:
+            raise ValueError("a cutting has a side of at least 32 pixels and at least 2 segments")
+        if not 0 < cutting.least < cutting.largest <= 1:
+            raise ValueError(f"least and largest are shares, the smaller first: {cutting.least:g}, {cutting.largest:g}")
     with np.errstate(over="ignore", invalid="ignore"):
         metres = depth.astype(np.float32)
     metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))

@@ -21,8 +21,8 @@ class Affinity:
     size: float = 0.3  # the power of the smaller region's share of the frame: small ones are joined first
 
 
-GEOMETRY = Affinity(jump=1.0, crease=0.5, bend=0.2, contrast=0.0, colour=0.0)
-BOTH = Affinity(jump=1.0, crease=0.3, bend=0.1, contrast=0.5, colour=0.5)
+GEOMETRY = Affinity(jump=1.0, crease=1.5, bend=0.2, contrast=0.0, colour=0.0)
+BOTH = Affinity(jump=1.0, crease=1.0, bend=0.1, contrast=0.5, colour=0.5)
 COLOUR = Affinity(jump=0.2, crease=0.0, bend=0.0, contrast=0.5, colour=1.0)
 AFFINITIES = (GEOMETRY, BOTH, COLOUR)
 

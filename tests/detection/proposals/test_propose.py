@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ipjax.detection.proposals.candidates import Cutting
 from ipjax.detection.proposals.propose import ProposalConfig, propose, suppress
 from ipjax.records import Camera
 from ipjax.synthetic.objects import make_object
@@ -127,7 +128,7 @@ def test_nothing_to_see_is_no_error():
         ({"depth": np.zeros((60, 80), np.uint16)}, "metres as floats"),
         ({"camera": (0, 0, 40, 30)}, "singular"),
         ({"config": ProposalConfig(most=0)}, "at least 1"),
-        ({"config": ProposalConfig(least=0.3)}, "smaller first"),
+        ({"config": ProposalConfig(cuttings=(Cutting(least=0.3),))}, "smaller first"),
     ],
 )
 def test_says_what_is_wrong(change, words):
