@@ -1,16 +1,17 @@
 """All masks that one resolution gives: joins of segments under several affinities, and pieces off the planes."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Int
 
 from ipjax.detection.proposals.components import find_basins, find_components
 from ipjax.detection.proposals.objectness import Measures, find_steps, judge, measure_masks, measure_regions
-from ipjax.detection.proposals.planes import find_planes
 from ipjax.detection.proposals.segments import Segments, make_segments, sum_over_pairs
 from ipjax.detection.proposals.surfaces import Surfaces
 from ipjax.detection.proposals.trees import AFFINITIES, grow_tree
+from ipjax.detection.proposals.windows import find_windows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,17 +49,25 @@ class Candidates:
 
 
 def make_candidates(
-    surfaces: Surfaces, cutting: Cutting, planes: int, plane_tolerance: float, plane_share: float, seed: int
+    surfaces: Surfaces, on: Bool[np.ndarray, "h w"], cutting: Cutting, diameters: Sequence[float] = ()
 ) -> Candidates:
-    """Every mask of a frame at its resolution, of the sizes that are allowed."""
-    found = find_planes(surfaces, planes, plane_tolerance, plane_share, seed)
-    on = np.zeros(surfaces.shape, bool)
-    for pixels, _ in found:
-        on |= pixels
+    """Every mask of a frame at its resolution, of the sizes that are allowed.
+
+    Args:
+      surfaces: the frame.
+      on: the pixels of large planes.
+      cutting: how it is cut up.
+      diameters: metres, of the things that are sought, where they are known.
+    """
     segments = make_segments(surfaces, cutting.segments, cutting.compactness)
     members, ways = _join(surfaces, segments, on, cutting)
     least = int(cutting.least * on.size)
-    kinds = [find_components(surfaces, ~on & surfaces.trusted, least=least), find_basins(surfaces, least=least)]
+    off = ~on & surfaces.trusted
+    kinds = [
+        find_components(surfaces, off, least=least),
+        find_basins(surfaces, least=least),
+        find_windows(surfaces, off, diameters, least=least),
+    ]
     kinds = [kind[kind.mean((1, 2)) <= cutting.largest] for kind in kinds]
     pieces = np.concatenate(kinds)
     steps = find_steps(surfaces)
@@ -73,9 +82,7 @@ def make_candidates(
     best = np.sort(np.argsort(-judge(both), kind="stable")[: cutting.most])
     some = Measures(**{name: getattr(both, name)[best] for name in names})
     regions = best[best < len(members)]
-    return Candidates(
-        segments.labels, members[regions], pieces[best[len(regions) :] - len(members)], ways[best], some
-    )
+    return Candidates(segments.labels, members[regions], pieces[best[len(regions) :] - len(members)], ways[best], some)
 
 
 def _join(surfaces: Surfaces, segments: Segments, on: np.ndarray, cutting: Cutting) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ from ipjax.detection.proposals.surfaces import Surfaces
 
 # Steps of depth (a share of it), of colour (ΔE) and between normals (1 − cosine) that are as strong as can be.
 _JUMP, _CONTRAST, _CREASE = 0.03, 44.0, 0.4
+_LONG, _SHORT = 0.4, 0.05  # metres beyond which what is seen is longer or shorter than most things to pick up
 _WEAK = 0.25  # of such a step; a border weaker than this is hardly seen
 
 
@@ -62,6 +63,8 @@ class Measures:
             self.inner,
             self.on_plane,
             np.log1p(self.votes),
+            np.log(np.maximum(self.length / _LONG, 1)),
+            np.log(np.maximum(_SHORT / np.where(self.length > 0, self.length, _SHORT), 1)),
         ]
         return np.stack(columns, -1)
 
@@ -148,7 +151,7 @@ def count_votes(
 
 
 # Of a logistic regression on made scenes; see `benchmarks.proposals`. In the order of `Measures.stack`.
-WEIGHTS = np.array([0, 1, 0, 0, 0, -0.5, 0.05, 0, 0.1, 0, 0, 0, 0])
+WEIGHTS = np.array([0, 1, 0, 0, 0, -0.5, 0.05, 0, 0.1, 0, 0, 0, 0, 0, 0])
 
 
 def judge(measures: Measures) -> Float[np.ndarray, " n"]:

@@ -13,7 +13,7 @@ _ALIKE = 0.85  # cosine between the normal at a point and that of its plane
 
 def find_planes(
     surfaces: Surfaces, most: int, tolerance: float, least_share: float, seed: int = 0
-) -> list[tuple[Bool[np.ndarray, "h w"], Float[np.ndarray, "4"]]]:
+) -> list[Float[np.ndarray, "4"]]:
     """Planes by RANSAC, the largest first; each is sought among what the others left.
 
     Args:
@@ -24,8 +24,8 @@ def find_planes(
       seed: of the points that are drawn.
 
     Returns:
-      For each its pixels, and (n, d) with n · x + d = 0 for its points, n of unit length and towards the camera: metres
-      in front of the plane are n · x + d.
+      For each (n, d) with n · x + d = 0 for its points, n of unit length and towards the camera: metres in front of the
+      plane are n · x + d.
     """
     rng = np.random.default_rng(seed)
     points = surfaces.points.reshape(-1, 3).astype(np.float64)
@@ -48,12 +48,23 @@ def find_planes(
         on = _lies_on(plane, points, normals, allowed) & surfaces.trusted.reshape(-1)
         if (on & free).sum() < least_share * free.size:
             break
-        # Normals beside an edge are those of both sides; what lies on the plane between others that do does, too.
-        near = np.abs(points @ plane[:3] + plane[3]) < allowed
-        closed = cv2.morphologyEx(on.reshape(surfaces.shape).view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-        found.append((closed.view(bool) & near.reshape(surfaces.shape), plane))
+        found.append(plane)
         free &= ~on
     return found
+
+
+def mark_planes(surfaces: Surfaces, planes: list[Float[np.ndarray, "4"]], tolerance: float) -> Bool[np.ndarray, "h w"]:
+    """The pixels that lie on any of the planes, at whatever resolution these were found."""
+    points, normals = surfaces.points.reshape(-1, 3), surfaces.normals.reshape(-1, 3)
+    allowed = tolerance * points[:, 2] ** 1.5
+    marked = np.zeros(surfaces.shape, bool)
+    for plane in planes:
+        on = (_lies_on(plane, points, normals, allowed) & surfaces.trusted.reshape(-1)).reshape(surfaces.shape)
+        # Normals beside an edge are those of both sides; what lies on the plane between others that do does, too.
+        near = np.abs(points @ plane[:3] + plane[3]) < allowed
+        closed = cv2.morphologyEx(on.view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+        marked |= closed.view(bool) & near.reshape(surfaces.shape)
+    return marked
 
 
 def _lies_on(plane, points, normals, allowed) -> np.ndarray:

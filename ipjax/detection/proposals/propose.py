@@ -8,9 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ipjax.detection.proposals.candidates import Candidates, Cutting, make_candidates
-from ipjax.detection.proposals.objectness import count_votes, judge
+from ipjax.detection.proposals.objectness import Measures, count_votes, judge
+from ipjax.detection.proposals.planes import find_planes, mark_planes
 from ipjax.detection.proposals.surfaces import make_surfaces
 from ipjax.files.cameras.reading import as_intrinsics
+
+_LONGER = 1.4  # times its diameter: a thing is not seen longer than that, depth and masks being what they are
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,6 +26,9 @@ class ProposalConfig:
     plane_tolerance: float = 0.008  # metres at 1 m; grows with z^1.5
     plane_share: float = 0.05  # of the image that a plane covers at least
     overlap: float = 0.7  # IoU from which the lesser of two proposals is dropped
+    # Metres, of the things that are sought, where they are known: balls of that size are tried, too, and masks that are
+    # longer than the largest are left out.
+    diameters: tuple[float, ...] = ()
     seed: int = 0
 
 
@@ -52,9 +58,14 @@ def propose(rgb: Any, depth: Any, camera: Any, config: ProposalConfig | None = N
     config = ProposalConfig() if config is None else config
     rgb, depth, matrix = _check(rgb, depth, camera, config)
     made = make_all(rgb, depth, matrix, config)
-    masks, objectness, owner = pool(made)
+    masks, measures, owner = pool(made)
+    objectness = np.concatenate([judge(each) for each in measures])
+    if config.diameters:
+        length = np.concatenate([each.length for each in measures])
+        objectness = np.where(length > _LONGER * max(config.diameters), -np.inf, objectness)
     height, width = depth.shape
     kept = suppress(masks, objectness, config.overlap, config.most)
+    kept = kept[np.isfinite(objectness[kept])]
     large = np.zeros((len(kept), height, width), bool)
     for index, number in enumerate(kept):
         which, row = owner[number]
@@ -66,31 +77,32 @@ def make_all(rgb: np.ndarray, depth: np.ndarray, matrix: np.ndarray, config: Pro
     """The candidates of every resolution; no resolution is used that exceeds the image's, except the first."""
     height, width = depth.shape
     longer = max(height, width)
-    made = []
+    made, planes = [], []
     for index, cutting in enumerate(config.cuttings):
         if index and longer <= config.cuttings[index - 1].side:
             break
         scale = min(cutting.side / longer, 1.0)
         small = max(round(width * scale), 16), max(round(height * scale), 16)
         surfaces = make_surfaces(rgb, depth, matrix, *small)
-        made.append(make_candidates(surfaces, cutting, config.planes, config.plane_tolerance, config.plane_share, config.seed))
+        if not index:
+            planes = find_planes(surfaces, config.planes, config.plane_tolerance, config.plane_share, config.seed)
+        on = mark_planes(surfaces, planes, config.plane_tolerance)
+        made.append(make_candidates(surfaces, on, cutting, config.diameters if not index else ()))
     return made
 
 
-def pool(made: list[Candidates]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All masks at the first one's resolution, their objectness, and whose they are: (resolution, number)."""
+def pool(made: list[Candidates]) -> tuple[np.ndarray, list[Measures], np.ndarray]:
+    """All masks at the first one's resolution, what is measured of them, and whose they are: (resolution, number)."""
     height, width = made[0].labels.shape
     masks = np.concatenate([one.sample(width, height) for one in made])
     step = max(round(max(height, width) / 80), 1)
-    coarse = masks[:, step // 2 :: step, step // 2 :: step].reshape(len(masks), -1)
-    ways = np.concatenate([one.ways for one in made])
-    votes = count_votes(coarse, ways)
-    begin = np.cumsum([0] + [len(one.ways) for one in made])
-    objectness = [
-        judge(dataclasses.replace(one.measures, votes=votes[a:b])) for one, a, b in zip(made, begin[:-1], begin[1:], strict=True)
-    ]
-    owner = np.concatenate([np.stack([np.full(len(one.ways), k), np.arange(len(one.ways))], -1) for k, one in enumerate(made)])
-    return masks, np.concatenate(objectness), owner
+    votes = count_votes(
+        masks[:, step // 2 :: step, step // 2 :: step].reshape(len(masks), -1), np.concatenate([m.ways for m in made])
+    )
+    begin = np.cumsum([len(one.ways) for one in made])[:-1]
+    each = [dataclasses.replace(one.measures, votes=v) for one, v in zip(made, np.split(votes, begin), strict=True)]
+    owner = [(which, row) for which, one in enumerate(made) for row in range(len(one.ways))]
+    return masks, each, np.array(owner, int).reshape(-1, 2)
 
 
 def suppress(
@@ -139,6 +151,8 @@ def _check(rgb: Any, depth: Any, camera: Any, config: ProposalConfig) -> tuple[n
             raise ValueError("a cutting has a side of at least 32 pixels and at least 2 segments")
         if not 0 < cutting.least < cutting.largest <= 1:
             raise ValueError(f"least and largest are shares, the smaller first: {cutting.least:g}, {cutting.largest:g}")
+    if not all(np.isfinite(config.diameters)) or min(config.diameters, default=1) <= 0:
+        raise ValueError(f"diameters are positive metres, not {list(config.diameters)}")
     with np.errstate(over="ignore", invalid="ignore"):
         metres = depth.astype(np.float32)
     metres = np.where(np.isfinite(metres) & (metres > 0), metres, np.float32(0))

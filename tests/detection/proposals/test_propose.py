@@ -1,7 +1,10 @@
 """Proposals cover what is seen, whatever the frame's size and however much of its depth is missing."""
 
+import dataclasses
+
 import numpy as np
 import pytest
+from builders.tables import BLUE, RED, THREE, table_frame
 
 from ipjax.detection.proposals.candidates import Cutting
 from ipjax.detection.proposals.propose import ProposalConfig, propose, suppress
@@ -17,29 +20,6 @@ def best_overlaps(proposals, masks, first=20):
 
 def iou(one, other):
     return (one & other).sum() / max((one | other).sum(), 1)
-
-
-def table_frame(blocks, height=240, width=320, noise=0.001, seed=0):
-    """A grey table seen from above at a slant, and blocks: ((left, top, right, bottom), colour, metres of height).
-
-    Returns rgb, depth, K and a mask for each block.
-    """
-    rng = np.random.default_rng(seed)
-    matrix = np.array([[300.0, 0, (width - 1) / 2], [0, 300, (height - 1) / 2], [0, 0, 1]])
-    depth = np.broadcast_to(1.0 - 0.2 * np.linspace(-0.5, 0.5, height)[:, None], (height, width)).copy()
-    rgb = np.full((height, width, 3), 128.0)
-    masks = np.zeros((len(blocks), height, width), bool)
-    for mask, ((left, top, right, bottom), colour, up) in zip(masks, blocks, strict=True):
-        mask[top:bottom, left:right] = True
-        depth[mask] -= up
-        rgb[mask] = colour
-    rgb += rng.normal(0, 4, rgb.shape)
-    depth += rng.normal(0, noise, depth.shape)
-    return rgb.clip(0, 255).astype(np.uint8), depth.astype(np.float32), matrix, masks
-
-
-RED, BLUE, GREEN = (200, 50, 40), (40, 70, 190), (40, 160, 60)
-THREE = [((40, 60, 100, 130), RED, 0.08), ((150, 90, 200, 140), BLUE, 0.05), ((230, 150, 290, 215), GREEN, 0.1)]
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +43,9 @@ def test_covers_blocks_on_a_table_without_noise_and_with():
         assert min(best_overlaps(propose(rgb, depth, matrix), masks, 10)) >= 0.85
 
 
-def test_the_same_frame_gives_the_same(scene):
-    one, other = (propose(scene.rgb, scene.depth, scene.camera) for _ in range(2))
+def test_the_same_frame_gives_the_same():
+    rgb, depth, matrix, _ = table_frame(THREE)
+    one, other = (propose(rgb, depth, matrix) for _ in range(2))
     np.testing.assert_array_equal(one.masks, other.masks)
     np.testing.assert_array_equal(one.objectness, other.objectness)
 
@@ -108,9 +89,29 @@ def test_odd_sizes(height, width):
 
 
 def test_a_camera_in_any_form_gives_the_same():
-    rgb, depth, matrix, _ = table_frame(THREE)
+    rgb, depth, matrix, _ = table_frame([((20, 20, 60, 60), RED, 0.1)], 80, 100)
     camera = Camera.from_matrix(matrix)
     np.testing.assert_array_equal(propose(rgb, depth, matrix).masks, propose(rgb, depth, camera).masks)
+
+
+def test_a_second_resolution_finds_what_is_small():
+    rgb, depth, matrix, masks = table_frame([((300, 200, 324, 224), RED, 0.03)], 480, 640)
+    config = ProposalConfig()
+    both = best_overlaps(propose(rgb, depth, matrix, config), masks)[0]
+    coarse = best_overlaps(
+        propose(rgb, depth, matrix, dataclasses.replace(config, cuttings=config.cuttings[:1])), masks
+    )[0]
+    assert both >= 0.7 and both >= coarse
+
+
+def test_a_known_diameter_leaves_out_what_is_longer():
+    rgb, depth, matrix, masks = table_frame(THREE)
+    config = ProposalConfig(diameters=(0.12,))
+    proposals = propose(rgb, depth, matrix, config)
+    spans = [np.ptp(np.stack(np.nonzero(mask)), axis=1).max() for mask in proposals.masks]
+    assert len(spans) and max(spans) * 1.1 / 300 < 1.6 * 0.12
+    small = best_overlaps(propose(rgb, depth, matrix, ProposalConfig(diameters=(0.3,))), masks)
+    assert min(small) >= 0.8
 
 
 def test_nothing_to_see_is_no_error():
@@ -127,6 +128,7 @@ def test_nothing_to_see_is_no_error():
         ({"depth": np.zeros((60, 81), np.float32)}, "does not fit"),
         ({"depth": np.zeros((60, 80), np.uint16)}, "metres as floats"),
         ({"camera": (0, 0, 40, 30)}, "singular"),
+        ({"config": ProposalConfig(diameters=(0.1, -1.0))}, "positive metres"),
         ({"config": ProposalConfig(most=0)}, "at least 1"),
         ({"config": ProposalConfig(cuttings=(Cutting(least=0.3),))}, "smaller first"),
     ],
