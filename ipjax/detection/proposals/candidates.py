@@ -33,7 +33,7 @@ class Candidates:
     labels: Int[np.ndarray, "h w"]
     members: Bool[np.ndarray, "n s"]
     pieces: Bool[np.ndarray, "m h w"]
-    ways: Int[np.ndarray, " n+m"]  # a bit for each way in which it was made
+    ways: Int[np.ndarray, " k"]  # a bit for each way in which it was made
     measures: Measures
 
     def mask(self, number: int) -> Bool[np.ndarray, "h w"]:
@@ -41,7 +41,7 @@ class Candidates:
         rest = number - len(self.members)
         return self.members[number][self.labels] if rest < 0 else self.pieces[rest]
 
-    def sample(self, width: int, height: int) -> Bool[np.ndarray, "n+m h w"]:
+    def sample(self, width: int, height: int) -> Bool[np.ndarray, "k h w"]:
         """All of them at another resolution, a pixel for a pixel."""
         rows = ((np.arange(height) + 0.5) * self.labels.shape[0] / height).astype(int)[:, None]
         columns = ((np.arange(width) + 0.5) * self.labels.shape[1] / width).astype(int)

@@ -160,7 +160,7 @@ def judge(measures: Measures) -> Float[np.ndarray, " n"]:
 
 
 def _pixel_values(surfaces: Surfaces, on: np.ndarray) -> Float[np.ndarray, "p 9"]:
-    """What is summed over each mask: 1, x, y, x², xy, y², whether on a plane, depth where it is trusted, and if it is."""
+    """What is summed over each mask: 1, x, y, x², xy, y², if it is on a plane, depth where it is trusted, if it is."""
     y, x = np.indices(surfaces.shape, dtype=np.float64).reshape(2, -1)
     trusted = surfaces.trusted.reshape(-1)
     depth = surfaces.depth.reshape(-1) * trusted

@@ -68,7 +68,7 @@ def propose(rgb: Any, depth: Any, camera: Any, config: ProposalConfig | None = N
     kept = kept[np.isfinite(objectness[kept])]
     large = np.zeros((len(kept), height, width), bool)
     for index, number in enumerate(kept):
-        which, row = owner[number]
+        which, row = owner[number].tolist()
         large[index] = enlarge(made[which].mask(row), width, height)
     return Proposals(large, objectness[kept])
 

@@ -108,8 +108,8 @@ def test_a_known_diameter_leaves_out_what_is_longer():
     rgb, depth, matrix, masks = table_frame(THREE)
     config = ProposalConfig(diameters=(0.12,))
     proposals = propose(rgb, depth, matrix, config)
-    spans = [np.ptp(np.stack(np.nonzero(mask)), axis=1).max() for mask in proposals.masks]
-    assert len(spans) and max(spans) * 1.1 / 300 < 1.6 * 0.12
+    reach = lambda found: max(np.ptp(np.stack(np.nonzero(mask)), axis=1).max() for mask in found.masks) / 300
+    assert reach(proposals) < 2 * 0.12 < reach(propose(rgb, depth, matrix))  # pixels that are a metre away
     small = best_overlaps(propose(rgb, depth, matrix, ProposalConfig(diameters=(0.3,))), masks)
     assert min(small) >= 0.8
 
