@@ -22,6 +22,7 @@ from ipjax.files.images.arrays import as_native, load_npz
 from ipjax.files.images.masks import as_mask
 from ipjax.files.images.polygons import fill_polygons
 from ipjax.files.images.run_lengths import decode_rle
+from ipjax.files.storage.budget import check_budget
 from ipjax.files.storage.parsing import read_json
 
 Box = tuple[float, float, float, float]  # x, y, width, height; pixels
@@ -29,6 +30,7 @@ Size = tuple[int, int]  # height, width
 _MASKS = ("segmentation", "segmentations", "masks", "mask")
 _SCORES = ("score", "scores", "predicted_iou", "iou_predictions")
 _CATEGORIES = ("category_id", "category_ids")
+_BYTES_PER_ENTRY = 1024  # of an annotation and its columns, without its mask
 _NPZ = (*_MASKS, *_SCORES, *_CATEGORIES, "scene_id", "image_id", "im_id", "bbox", "time")
 
 
@@ -83,7 +85,7 @@ def decode_segmentation(segmentation: Any, size: Size | None = None) -> np.ndarr
     if isinstance(segmentation, np.ndarray):
         values = as_native(segmentation)
         # What a segmenter gives before its threshold is below 0 outside the object.
-        is_raw = values.dtype.kind == "f" and values.size > 0 and float(np.nanmin(values)) < 0
+        is_raw = values.dtype.kind == "f" and bool((values < 0).any())
         return as_mask(values > 0 if is_raw else values)
     if not isinstance(segmentation, list) or not segmentation:
         raise ValueError("a segmentation must be run lengths (size, counts), polygons, or rows of 0 and 1")
@@ -220,9 +222,11 @@ def as_stack(masks: np.ndarray, path: Path) -> np.ndarray:
         masks = masks[:, 0]
     elif masks.ndim == 2:
         masks = masks[None]
-    if masks.ndim != 3 or masks.dtype.kind not in "buif":
+    if masks.ndim != 3 or masks.dtype.kind not in "buif" or (len(masks) and not masks.size):
         shape = " × ".join(map(str, masks.shape)) or "a number"
         raise ValueError(f"{path}: masks must be numbers, n × height × width, not {masks.dtype}, {shape}")
+    # Masks of a pixel or two take next to nothing, but what is kept of each does not.
+    check_budget(_BYTES_PER_ENTRY * len(masks), f"{path}: {len(masks):,} masks")
     return masks
 
 

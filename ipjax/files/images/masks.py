@@ -9,6 +9,8 @@ from PIL import Image
 from ipjax.files.images.arrays import as_native, load_npy
 from ipjax.files.images.opening import check_upright, get_orientation, open_image, undo_stretching
 
+_LARGEST_LABEL = 63  # of an image of whole numbers, that no image of black and white stops at
+
 
 def read_mask(path: str | Path, label: int | None = None) -> np.ndarray:
     """A mask as bool, height × width: the bright one of two values; soft edges are cut in the middle.
@@ -140,7 +142,9 @@ def _threshold(values: np.ndarray, colours: np.ndarray | None) -> np.ndarray:
         raise ValueError(
             f"the mask has no black: its values go from {low:g} to {high:g}; the object must be white, all else black"
         )
-    dark, bright = values <= 0.1 * full, values >= 0.9 * full
+    # Compression and scaling blur masks whose white is bright; of small whole numbers each is a label of its own.
+    exact = values.dtype.kind in "ui" and full <= _LARGEST_LABEL
+    dark, bright = (values == 0, values == full) if exact else (values <= 0.1 * full, values >= 0.9 * full)
     found = values > 0.5 * full
     if not ((values == low) | (values == high)).all():
         _check_two_values(values, full, dark, bright, found)

@@ -110,6 +110,12 @@ TWO = {
     "stack with a channel": ("d.npy", BOTH[:, None].astype(np.uint8), [None, None], [None, None]),
     "labels, 8 bits": ("d.png", Image.fromarray(LABELS), [None, None], [None, None]),
     "labels, 16 bits": ("d.png", Image.fromarray(LABELS.astype(np.uint16) * 1000), [None, None], [None, None]),
+    "labels of nearly the same number": (
+        "d.png",
+        Image.fromarray((FIRST * 14 + SECOND * 15).astype(np.uint8)),
+        [None, None],
+        [None, None],
+    ),
     "labels as an array": ("d.npy", LABELS.astype(np.int64), [None, None], [None, None]),
     "palette of three": ("d.png", palette_image(LABELS), [None, None], [None, None]),
     "flat colours": ("d.png", Image.fromarray(COLOURS), [None, None], [None, None]),
@@ -163,6 +169,13 @@ def test_the_image_of_several_is_chosen(tmp_path):
     assert one.index == 2
 
 
+def test_a_small_number_close_to_a_large_one_is_a_label_and_no_dirt(tmp_path):
+    labels = np.zeros(SIZE, np.uint8)
+    labels[10:20, 10:20], labels[10:30, 21:40] = 1, 21
+    first, second = read_candidates(write(tmp_path / "m.png", Image.fromarray(labels)), size=SIZE)
+    assert (first.mask == (labels == 1)).all() and (second.mask == (labels == 21)).all()
+
+
 class Hostile:
     """What unpickles to a program."""
 
@@ -185,6 +198,10 @@ REFUSED = {
     "pickled npy": ("d.npy", PICKLED, "Python objects"),
     "pickled npz": ("d.npz", {"masks": PICKLED}, "Python objects"),
     "npz of gigabytes": ("d.npz", npz_of_zeros((2000, 2000, 2000)), "MB of memory"),
+    "npz of masks without pixels": ("d.npz", npz_of_zeros((10**10, 0, 0)), "masks must be numbers"),
+    "npz of millions of pixels, a mask each": ("d.npz", npz_of_zeros((2**20, 1, 1)), "1,048,576 masks would take"),
+    "npy of masks without pixels": ("d.npy", np.ones((10**10, 0, 0), bool), "masks must be numbers"),
+    "npy of nothing but NaN": ("d.npy", np.full((2, *SIZE), np.nan, np.float32), "mask 0: .* not finite"),
     "npz cut short": ("d.npz", npz_of_zeros((20, 2000, 2000)), "not a readable npz file"),
     "npz of something else": ("d.npz", {"vertices": np.zeros(3)}, "it has no masks"),
     "npz with scores of others": ("d.npz", {"masks": BOTH, "scores": np.ones(3)}, "2 masks, but 3 of scores"),
