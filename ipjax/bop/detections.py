@@ -10,7 +10,6 @@ import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -38,10 +37,19 @@ class Detection:
     segmentation: Any = field(repr=False, default=None)  # of any form that `decode_segmentation` knows
     size: tuple[int, int] | None = field(repr=False, default=None)  # height, width; polygons need it
 
-    @cached_property
+    @property
     def mask(self) -> np.ndarray | None:
-        """The segmentation as bool [h, w]; None where there is only a box."""
-        return None if self.segmentation is None else decode_segmentation(self.segmentation, self.size)
+        """The segmentation as bool [h, w], decoded anew: those of a data set would not fit into memory together.
+
+        None where there is only a box. Raises DatasetError for what is damaged; names scene, image and object.
+        """
+        if self.segmentation is None:
+            return None
+        try:
+            return decode_segmentation(self.segmentation, self.size)
+        except ValueError as error:
+            where = f"the mask of object {self.obj_id} in scene {self.scene_id}, image {self.im_id}"
+            raise DatasetError(f"{where}: {error}") from None
 
 
 def as_detection(
@@ -134,7 +142,7 @@ def write_detections(path: str | Path, detections: Iterable[Detection]) -> Path:
             "category_id": int(one.obj_id),
             "score": float(one.score),
             "bbox": [] if one.box is None else [int(x) if float(x).is_integer() else float(x) for x in one.box],
-            "segmentation": {} if one.mask is None else encode_rle(one.mask, compressed=False),
+            "segmentation": {} if (mask := one.mask) is None else encode_rle(mask, compressed=False),
             "time": float(one.time),
         }
         lines.append(json.dumps(entry, sort_keys=True))

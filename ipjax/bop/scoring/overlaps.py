@@ -125,6 +125,9 @@ def score_detections(
         whole = {}
         if "bbox" in used:
             whole = {t.index: _read_box(dataset, image, t, shown[t.index], boxes, notes) for t in truths}
+        masks: dict[int, np.ndarray] = {}
+        if "segm" in used:
+            mine, masks = _decode_masks(mine, list(shown.values()), problems if on_error == "skip" else None)
         for obj in sorted({t.obj_id for t in truths} | {one.obj_id for one in mine}):
             here = [(t, s) for t, s in zip(truths, skipped, strict=True) if t.obj_id == obj]
             for kind in used:
@@ -138,7 +141,10 @@ def score_detections(
                         np.array([whole[t.index] for t, _ in here], np.float64).reshape(-1, 4),
                     )
                 else:
-                    overlaps = _overlap_masks(found, [shown[t.index] for t, _ in here])
+                    overlaps = np.zeros((len(found), len(here)))
+                    if overlaps.size:
+                        given = np.stack([masks[id(d)] for d in found])
+                        overlaps = mask_overlaps(given, np.stack([shown[t.index] for t, _ in here]))
                 scores = np.array([d.score for d in found], np.float64)
                 row = overlaps, scores, np.array([s for _, s in here], bool)
                 table[kind].setdefault(obj, []).append(row)
@@ -207,23 +213,32 @@ def _read_box(
     return box
 
 
-def _overlap_masks(found: list[Detection], truths: list[np.ndarray]) -> np.ndarray:
-    if not found or not truths:
-        return np.zeros((len(found), len(truths)))
-    stack = np.stack(truths)
-    masks = []
+def _decode_masks(
+    found: list[Detection], shown: list[np.ndarray], problems: list[str] | None
+) -> tuple[list[Detection], dict[int, np.ndarray]]:
+    """The detections of one image whose masks are whole, and the masks, by the detections' identity.
+
+    Args:
+        shown: annotated masks of the image, which say how large it is.
+        problems: gets a sentence for each of the others; None = DatasetError is raised.
+    """
+    kept, masks = [], {}
     for one in found:
-        where = f"the mask of object {one.obj_id} in scene {one.scene_id}, image {one.im_id}"
         try:
             mask = one.mask
-        except ValueError as error:
-            raise DatasetError(f"{where}: {error}") from None
-        assert mask is not None
-        if mask.shape != stack.shape[1:]:
-            size, other = (f"{w} × {h}" for h, w in (mask.shape, stack.shape[1:]))
-            raise DatasetError(f"{where} is {size}, but the image {other}")
-        masks.append(mask)
-    return mask_overlaps(np.stack(masks), stack)
+            if mask is not None and shown and mask.shape != shown[0].shape:
+                where = f"the mask of object {one.obj_id} in scene {one.scene_id}, image {one.im_id}"
+                size, other = (f"{w} × {h}" for h, w in (mask.shape, shown[0].shape))
+                raise DatasetError(f"{where} is {size}, but the image {other}")
+        except DatasetError as error:
+            if problems is None:
+                raise
+            problems.append(str(error))
+            continue
+        kept.append(one)
+        if mask is not None:
+            masks[id(one)] = mask
+    return kept, masks
 
 
 def _summarise(by_object: dict[int, Images]) -> Precision:
