@@ -1,5 +1,6 @@
 """Other people's masks: whatever a segmenter or a detector has written, as candidates of one image."""
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from ipjax.files.images.arrays import load_npy
 from ipjax.files.images.masks import as_mask, read_values
 from ipjax.files.images.opening import BYTES_PER_PIXEL
 from ipjax.files.storage.budget import check_budget
+
+log = logging.getLogger("ipjax")
 
 DETECTIONS = (".json", ".npz")
 _MOST_LABELS = 1000  # of one image; a photo has more colours
@@ -74,7 +77,8 @@ def choose_image(
 ) -> list[tuple[int, Annotation]]:
     """The annotations of one image, each with its number in the file.
 
-    An image that only one scene has is found without its scene. What does not say of which image it is, is of any.
+    An image that only one scene has is found without its scene. What does not say of which image it is, is of any. Of
+    a file of one image that is the one, and a note says where its number is another: segmenters number as they like.
 
     Raises:
         ValueError: there are several images and none was chosen, or none of the one that was.
@@ -89,6 +93,9 @@ def choose_image(
         if len(keys) > 1:
             what = f"image {image} in {len(keys)} scenes" if image is not None else f"{len(keys)} images"
             raise ValueError(f"{path}: it has detections of {what}: say which is this one (--image, --scene)")
+    other = next((key[1] for key in keys), None)
+    if image is not None and other not in (None, image):
+        log.info("%s: its detections are of image %s, and are taken for those of image %s", path, other, image)
     return [(i, one) for i, one in enumerate(annotations) if (one.scene_id, one.image_id) in keys]
 
 

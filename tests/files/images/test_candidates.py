@@ -169,6 +169,16 @@ def test_the_image_of_several_is_chosen(tmp_path):
     assert one.index == 2
 
 
+def test_the_only_image_of_a_file_is_taken_and_told(tmp_path, caplog):
+    path = write(tmp_path / "d.json", [bop(FIRST)])
+    with caplog.at_level("INFO", "ipjax"):
+        for image, told in ((None, 0), (7, 0), (6, 1)):
+            caplog.clear()
+            (one,) = read_candidates(path, image=image)
+            assert one.index == 0 and len(caplog.records) == told
+    assert "of image 7, and are taken for those of image 6" in caplog.text
+
+
 def test_a_small_number_close_to_a_large_one_is_a_label_and_no_dirt(tmp_path):
     labels = np.zeros(SIZE, np.uint8)
     labels[10:20, 10:20], labels[10:30, 21:40] = 1, 21
