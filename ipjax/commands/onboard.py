@@ -29,6 +29,7 @@ depth is found through that photo: its rotation does not rest on the guessed sha
 its photo did not show; with the photo beside the mesh, a pose that rests on that is called less sure.
 """
 PHOTOS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+UNREAD_PHOTOS = (".heic", ".heif", ".avif")  # what phones write, and Pillow alone does not read
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 # Options that make sense for a photo only, as argparse names them.
 PHOTO_ONLY = ("mask", "mask_label", "box", "click", "depth", "camera", "image", "depth_scale")
@@ -139,6 +140,9 @@ def _check(arguments: argparse.Namespace) -> bool:
     is_photo = source.suffix.lower() in PHOTOS
     if not source.is_file():
         raise ValueError(f"{source}: no such {'photo' if is_photo else 'mesh'}")
+    for path in (source, arguments.photo):
+        if path is not None and path.suffix.lower() in UNREAD_PHOTOS:
+            raise ValueError(f"{path}: photos of the format {path.suffix} are not read here: save it as JPEG or PNG")
     if arguments.photo is None and arguments.photo_camera is not None:
         raise ValueError("--photo-camera belongs to --photo")
     if arguments.photo is not None and not is_photo and not arguments.photo.is_file():

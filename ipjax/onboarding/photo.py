@@ -33,7 +33,6 @@ from ipjax.records import Camera, Templates
 
 log = logging.getLogger("ipjax")
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 _PICTURE = 320  # pixels, longest side of the kept photo
 
 

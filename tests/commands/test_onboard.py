@@ -41,6 +41,15 @@ def test_bad_meshes_are_refused_in_one_line(case, capfd, monkeypatch, content, w
     assert not (case / "bad.ipjax").exists()
 
 
+@pytest.mark.parametrize("words", [["IMG_1.HEIC"], ["egg.ply", "--photo", "IMG_1.HEIC"]])
+def test_a_photo_as_phones_write_it_but_nothing_here_reads_is_told_what_to_become(case, capfd, words):
+    for name in ("IMG_1.HEIC", "egg.ply"):
+        (case / name).touch()
+    assert run(["onboard", *(str(case / word) if "." in word else word for word in words), "-o", "egg.ipjax"]) == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1 and "save it as JPEG or PNG" in error, error
+
+
 def test_a_mesh_becomes_an_object_file(case, capfd, monkeypatch):
     encoder = Encoder(DinoV2(tiny("plain", 1), rngs=nnx.Rngs(0)), 0, "dinov2 tiny block=0 norm=1 float32 sha256:none")
     monkeypatch.setattr("ipjax.commands.interface.options.load_encoder", lambda arguments: encoder)
