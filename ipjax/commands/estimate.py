@@ -384,7 +384,9 @@ def _summary(frame: str, one: dict[str, Any]) -> str:
         ending += "; NOT HERE, or not seen well enough: the pose is a guess"
     x, y, z = (1e3 * v for v in one["camera_from_object"]["translation_m"])
     size = one["size_mm"]
+    # A size that was told, or that the photo's depth measured, was not estimated: ± 0 would say that it is exact.
+    spread = f" ± {size['diameter_std']:.1f} mm" if one["size_given_mm"] is None else " mm (given)"
     return (
-        f"{frame}: {one['object']}: centre ({x:.0f}, {y:.0f}, {z:.0f}) mm, diameter {size['diameter']:.1f} ± "
-        f"{size['diameter_std']:.1f} mm, {one['inliers']} inliers, confidence {one['confidence']:.2f}{ending}"
+        f"{frame}: {one['object']}: centre ({x:.0f}, {y:.0f}, {z:.0f}) mm, diameter {size['diameter']:.1f}{spread}, "
+        f"{one['inliers']} inliers, confidence {one['confidence']:.2f}{ending}"
     )

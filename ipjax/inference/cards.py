@@ -85,8 +85,10 @@ def draw_card(estimate: PoseEstimate, info: ObjectInfo, evidence: Evidence | Non
     pose = estimate.camera_from_object
     centre = ", ".join(f"{1e3 * float(x):.0f}" for x in np.asarray(pose.translation))
     pairs = 0 if evidence is None else len(evidence.inlier)
+    # Of a size that was given nothing was estimated: ± 0 would say that it is exact.
+    spread = f" ± {1e3 * float(estimate.scale_std):.1f} mm" if float(estimate.scale_std) > 0 else " mm (given)"
     rows = [
-        ("diameter", f"{1e3 * float(pose.scale):.1f} ± {1e3 * float(estimate.scale_std):.1f} mm"),
+        ("diameter", f"{1e3 * float(pose.scale):.1f}{spread}"),
         ("centre in camera", f"({centre}) mm"),
         ("inliers", f"{int(estimate.inliers)} pairs, rms {1e3 * float(estimate.rmse):.1f} mm"),
     ]

@@ -107,3 +107,13 @@ def test_a_card_tells_of_doubt():
     guess = draw(photo, K, make_estimate(placed(), present=False), INFO, height=480)
     loose = draw(photo, K, make_estimate(placed(), turn=1.5), INFO, height=480)
     assert (guess != sure).any() and (loose != sure).any()
+
+
+def test_a_size_that_was_given_is_not_told_as_exact():
+    """Rounded to ± 0.0 mm is another thing than not estimated at all."""
+    photo = np.full((240, 320, 3), 90, np.uint8)
+    given, exact = (
+        draw(photo, K, dataclasses.replace(make_estimate(placed()), scale_std=jnp.float32(std)), INFO, height=480)
+        for std in (0, 1e-9)
+    )
+    assert (given != exact).any()
