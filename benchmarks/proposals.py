@@ -1,7 +1,7 @@
 """How well masks that are proposed without knowing any object cover the objects of data sets.
 
     python -m benchmarks.proposals DATA [DATA …] [--page benchmarks/results/proposals.md]
-    python -m benchmarks.proposals --fit 24
+    python -m benchmarks.proposals --fit 24 [--scans FOLDER]
 
 Each DATA is a data set in BOP's layout. Every instance of an object among its targets is one; its mask is what is
 visible of it. Of the best 10, 40, 64, 120 proposals and of all that differ the one that overlaps it best counts.
@@ -112,25 +112,40 @@ def write_page(path: Path, rows: list[Coverage]) -> None:
     write_text(path, "\n".join(head) + "\n", parents=True)
 
 
-def make_scenes(count: int) -> Iterator[tuple]:
-    """Tables with 4 to 9 things of 6 to 30 cm, with what the sensor adds: rgb, depth, K, the visible masks."""
+def make_scenes(count: int, scans: Path | None) -> Iterator[tuple]:
+    """Tables with 4 to 9 things of 6 to 30 cm, with what the sensor adds: rgb, depth, K, the visible masks.
+
+    Half of the things are among the PLY files of ``scans``, if there is such a folder; the others are made in code.
+    """
+    from ipjax.files.meshes.loading import load_mesh
+    from ipjax.files.meshes.mesh import normalise
     from ipjax.synthetic.objects import KINDS, make_object
     from ipjax.synthetic.scenes import make_scene
 
+    scanned = [normalise(load_mesh(path)) for path in sorted(scans.glob("*.ply"))] if scans else []
     for seed in range(count):
         rng = np.random.default_rng([seed, 77])
-        many = int(rng.integers(4, 10))
-        objects = [make_object(KINDS[rng.integers(len(KINDS))], int(rng.integers(10**6))) for _ in range(many)]
+        many, objects = int(rng.integers(4, 10)), []
+        for _ in range(many):
+            if scanned and rng.uniform() < 0.5:
+                objects.append(scanned[rng.integers(len(scanned))])
+            else:
+                objects.append(make_object(KINDS[rng.integers(len(KINDS))], int(rng.integers(10**6))))
         sizes = np.exp(rng.uniform(np.log(0.06), np.log(0.3), many))
         scene = make_scene(objects, seed, sizes=sizes.tolist(), clutter=0, oversample=1)
         seen = scene.masks[(scene.visible > 0.1) & (scene.masks.sum((1, 2)) > 300)]
         yield scene.rgb, scene.depth, scene.matrix, seen
 
 
-def fit(count: int, config: ProposalConfig) -> np.ndarray:
-    """Weights by logistic regression of how well a candidate overlaps the object it overlaps most."""
+def fit(scenes: Iterator[tuple], config: ProposalConfig) -> np.ndarray:
+    """Weights by logistic regression of how well a candidate overlaps the object it overlaps most.
+
+    Twice as many candidates as usual are kept, so that those that the weights in use dislike take part.
+    """
+    more = [dataclasses.replace(cutting, most=2 * cutting.most) for cutting in config.cuttings]
+    config = dataclasses.replace(config, cuttings=tuple(more))
     features, wanted = [], []
-    for rgb, depth, matrix, truths in make_scenes(count):
+    for rgb, depth, matrix, truths in scenes:
         made = make_all(rgb, depth, matrix, config)
         masks, measures, _ = pool(made)
         small = np.stack([_shrink(truth, *masks.shape[1:]) for truth in truths])
@@ -171,9 +186,17 @@ def main() -> None:
     parser.add_argument("data", type=Path, nargs="*", help="data sets in BOP's layout")
     parser.add_argument("--page", type=Path, help="write the table here, too, with what it rests on")
     parser.add_argument("--fit", type=int, metavar="SCENES", help="fit the weights of objectness to so many scenes")
+    parser.add_argument("--scans", type=Path, help="a folder of meshes (PLY) that half of the things in them are of")
     options = parser.parse_args()
     if options.fit:
-        print(np.array2string(fit(options.fit, ProposalConfig()), precision=3, separator=", ", max_line_width=100))
+        print(
+            np.array2string(
+                fit(make_scenes(options.fit, options.scans), ProposalConfig()),
+                precision=3,
+                separator=", ",
+                max_line_width=100,
+            )
+        )
         return
     if not options.data:
         parser.error("give data sets, or --fit")

@@ -20,7 +20,7 @@ class Cutting:
 
     side: int = 320  # pixels of the image's longer side
     segments: int = 500
-    compactness: float = 0.12  # of the segments
+    compactness: float = 0.25  # of the segments
     least: float = 0.0012  # share of the image that a mask covers at least
     largest: float = 0.25  # and at most
     most: int = 800  # masks that are compared with one another, the best by what each shows alone

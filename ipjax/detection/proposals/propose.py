@@ -112,12 +112,14 @@ def suppress(
     packed = np.packbits(masks.reshape(len(masks), -1), axis=1)
     packed = np.ascontiguousarray(np.pad(packed, ((0, 0), (0, -packed.shape[1] % 8)))).view(np.uint64)
     order = np.argsort(-objectness, kind="stable")
-    packed, area = packed[order], masks.sum((1, 2))[order]
+    packed = packed[order]
+    area = np.bitwise_count(packed).sum(1, dtype=np.int64)
     alive, kept = np.ones(len(order), bool), []
     while alive.any() and len(kept) < most:
         best = int(alive.argmax())
         kept.append(best)
-        rest = np.flatnonzero(alive)
+        # Masks whose areas differ by more cannot overlap by so much.
+        rest = np.flatnonzero(alive & (area >= overlap * area[best]) & (area * overlap <= area[best]))
         common = np.bitwise_count(packed[rest] & packed[best]).sum(1, dtype=np.int64)
         alive[rest[common > overlap * (area[rest] + area[best] - common)]] = False
         alive[best] = False

@@ -26,7 +26,7 @@ def make_segments(surfaces: Surfaces, count: int, compactness: float) -> Segment
     Args:
       surfaces: the frame.
       count: how many segments, about.
-      compactness: of SLIC, for features that go from 0 to 1.
+      compactness: of SLIC, against colour: L* from 0 to 100 is 0.7.
     """
     from skimage.segmentation import slic
 
@@ -45,8 +45,10 @@ def make_segments(surfaces: Surfaces, count: int, compactness: float) -> Segment
     labels = slic(
         np.ascontiguousarray(features, np.float64),
         n_segments=count,
-        compactness=compactness,
-        max_num_iter=6,
+        # SLIC stretches features to a range of 1, which depth decides: without this, colour would count the less the
+        # deeper the scene.
+        compactness=compactness / max(float(np.ptp(features)), 1e-6),
+        max_num_iter=10,
         start_label=0,
         convert2lab=False,
         channel_axis=-1,
