@@ -36,7 +36,10 @@ QUERIES = 4  # of each made object
 def without_photo(templates: Any) -> Any:
     """The same templates as the mesh alone gives."""
     plain = dataclasses.replace(templates, seen=jnp.ones_like(templates.seen), photo_centre=None)
-    return eqx.tree_at(lambda t: t.surface.seen, plain, jnp.ones_like(templates.surface.seen))
+    surface = dataclasses.replace(
+        plain.surface, seen=jnp.ones_like(plain.surface.seen), along_std=None, across_std=None
+    )
+    return dataclasses.replace(plain, surface=surface)
 
 
 def turned_by(first: np.ndarray, second: np.ndarray) -> float:

@@ -108,7 +108,11 @@ class ResectConfig(eqx.Module):
     window: float = 2.0  # patches in which it is
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn
-    guess: float = 0.1  # standard deviation of the guessed distance from the front to the centre, in diameters
+    # Standard deviation of the guessed distance from the front to the centre, in diameters, where the surface does not
+    # say how far its points may be off.
+    guess: float = 0.1
+    # By which share of that of its points the whole back may be off; fitted to sizes of rendered pairs (seeds 1 and 7).
+    reach: float = 0.45
     independent: float = 20.0  # number of independent pairs; not fitted to real images
     noise: float = 0.15  # standard deviation of a match that fits perfectly, patches
 

@@ -63,6 +63,10 @@ class Surface(eqx.Module):
     points: Float[Array, "*b n 3"]  # model units
     normals: Float[Array, "*b n 3"]  # unit, outwards
     seen: Float[Array, "*b n"]  # 1 = measured or observed, 0 = guessed by the reconstruction
+    # Of an object from a photo, how far the point may be off along the photo's ray and across it: standard deviations,
+    # model units, as measured for the way it was made (`ipjax.files.objects.deviations`). None = a scan.
+    along_std: Float[Array, "*b n"] | None = None
+    across_std: Float[Array, "*b n"] | None = None
 
 
 class Appearance(eqx.Module):
@@ -164,7 +168,11 @@ class PoseEstimate(eqx.Module):
     # where candidates are not scored (the paper's method) the share of pairs that agree
     present: Bool[Array, "*b"]  # confident enough that the object is here; without it the pose is a guess
     covariance: Float[Array, "*b 6 6"]  # of rotation (rad, about the object's centre) and translation (m), camera axes
-    scale_std: Float[Array, "*b"]  # standard deviation of the scale, metres; 0 where the size was given
+    # The object's diameter, metres, and lowest and highest corner of its box along the object's axes, model units: the
+    # scale and the templates' own; of an object from a photo without depth with what the query measured of it.
+    diameter: Float[Array, "*b"]
+    box: Float[Array, "*b 2 3"]
+    scale_std: Float[Array, "*b"]  # standard deviation of the diameter, metres; 0 where the size was given
     ambiguity: Float[Array, "*b 3"]  # the object's axis about which the rotation is least certain; length = std in rad
     agreement: Agreement  # what the confidence rests on
     hypotheses: Hypotheses  # the alternatives, the answer first

@@ -75,7 +75,7 @@ class PhotoComparison:
     comparison: Comparison
     angle: float  # degrees between the directions from which the photo and the scene's camera see the object
     mask: float  # intersection over union of the photo's mask, as it was found, with the true one
-    guessed_size: float  # diameter of the guessed shape, metres: what `ipjax estimate` tells
+    told_size: float  # diameter that `ipjax estimate` tells: of the guessed shape with what was measured of it, metres
     size_std: float  # its standard deviation as the estimate says, metres
     confidence: float
     present: bool  # as the estimate says
@@ -87,8 +87,8 @@ class PhotoComparison:
             **self.comparison.as_json(),
             "angle_deg": self.angle,
             "mask_iou": self.mask,
-            "guessed_diameter_mm": 1e3 * self.guessed_size,
-            "guessed_diameter_std_mm": 1e3 * self.size_std,
+            "told_diameter_mm": 1e3 * self.told_size,
+            "told_diameter_std_mm": 1e3 * self.size_std,
             "confidence": self.confidence,
             "present": self.present,
         }
@@ -177,7 +177,7 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
             compare(found[1], true, original),
             photo.angle,
             float((made.foreground.mask & photo.mask).sum() / (made.foreground.mask | photo.mask).sum()),
-            float(estimate.camera_from_object.scale),
+            float(estimate.diameter),
             float(estimate.scale_std),
             float(estimate.confidence),
             bool(estimate.present),
@@ -274,7 +274,7 @@ def _print_outcome(
         if not photo.present:
             print("    the estimate itself calls this pose a guess (present is False)")
         print(
-            f"    the shape is guessed: it measures {photo.guessed_size * 1000:.1f} mm, give or take "
+            f"    the shape is guessed: with what the scene shows of it, it measures {photo.told_size * 1000:.1f} mm ± "
             f"{photo.size_std * 1000:.0f} (scale_std); its mask covers the true one by {photo.mask:.0%} (IoU)"
         )
     print()

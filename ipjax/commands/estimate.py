@@ -315,11 +315,12 @@ def _draw(name: str, images: Images, results: list[Any], config: Any, arguments:
     import numpy as np
 
     from ipjax.inference.drawing import draw, gather_evidence, write_image
+    from ipjax.inference.photos.corrected_mesh import correct_info
 
     rgb = images.rgb
     rgb = rgb if rgb.dtype == np.uint8 else (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
     evidence = [gather_evidence(r.templates, r.query, r.crop_estimate, r.info, config) for r in results]
-    picture = draw(rgb, images.camera, [r.estimate for r in results], [r.info for r in results], evidence)
+    picture = draw(rgb, images.camera, [r.estimate for r in results], [correct_info(r) for r in results], evidence)
     target = _picture_path(arguments.overlay, name, arguments)
     write_image(target, picture)
     return target

@@ -107,6 +107,8 @@ def estimate(
         certainty = _certainty(templates, scene, found, matched, used, config, drawing=drawing, scale_known=scale_known)
     found = PoseEstimate(
         camera_from_object=best.poses,
+        diameter=best.poses.scale,
+        box=jnp.stack([-templates.extents / 2, templates.extents / 2]),
         **certainty,
         hypotheses=Hypotheses(found.poses, jnp.clip(found.score, 0, 1)),
         view=matches.view[view],

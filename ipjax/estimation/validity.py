@@ -111,7 +111,7 @@ def finite_estimate(found: PoseEstimate) -> PoseEstimate:
 
     Estimates from finite records are finite, unless the settings make no sense: this is the last guard against those.
     """
-    uncertainty = found.confidence, found.covariance, found.scale_std, found.ambiguity
+    uncertainty = found.diameter, found.box, found.confidence, found.covariance, found.scale_std, found.ambiguity
     own = found.camera_from_object, *uncertainty, found.agreement, found.rmse
     fine = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(own)]))
     others = found.hypotheses
@@ -149,6 +149,7 @@ def _finite_camera(camera: Camera) -> tuple[Camera, Bool[Array, "*b"]]:
 
 def _finite_points(record: _Points) -> tuple[_Points, Bool[Array, ""]]:
     fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    fields = {name: x for name, x in fields.items() if x is not None}
     rows = [jnp.isfinite(x) if x.ndim == 1 else _finite_rows(x) for x in fields.values()]
     finite = jnp.all(jnp.stack(rows), axis=0)
     first = jnp.where(jnp.any(finite), record.points[jnp.argmax(finite)], 0)

@@ -47,7 +47,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     they rank behind all others and no feature is taken from them. Surface and appearance points repeat the first one
     with a normal of zero: they face no camera, so they are neither fitted nor drawn and widen no outline. Reference
     views are not padded: all have one size, as objects from photos have that were onboarded alike. Photos with depth,
-    which only choose among poses, are left out where not all of the objects have one.
+    which only choose among poses, are left out where not all of the objects have one; so is how far points of the
+    surface may be off, on which the deviations of objects from photos without depth rest.
     An object's estimate is the same as without padding, up to rounding, if it has at least ``config.match.views`` views
     and ``config.refine.points`` surface points; with fewer, it gets as many hypotheses and points as the others.
 
@@ -77,6 +78,8 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     for name in ("basis", "appearance", "photo_centre"):
         if len({getattr(o, name) is None for o in objects}) > 1:
             raise ValueError(f"some of these templates have their {name} and some have none; onboard them alike")
+    if any(o.surface.along_std is None or o.surface.across_std is None for o in objects):
+        objects = [_without_deviations(o) for o in objects]
     if not all(o.reference is not None and o.reference.measured for o in objects):
         objects = [_without_measured_photo(o) for o in objects]
     _check_references(objects)
@@ -106,6 +109,12 @@ def _without_measured_photo(templates: Templates) -> Templates:
     """Without the reference view of a photo with depth: objects that have none beside it are chosen without one."""
     reference = templates.reference
     return dataclasses.replace(templates, reference=None) if reference is not None and reference.measured else templates
+
+
+def _without_deviations(templates: Templates) -> Templates:
+    """Without what tells how far points may be off, which objects from photos without depth have alike."""
+    surface = dataclasses.replace(templates.surface, along_std=None, across_std=None)
+    return dataclasses.replace(templates, surface=surface)
 
 
 def _encoders(templates: Templates) -> list[str | None]:
@@ -138,6 +147,7 @@ def _pad(templates: Templates, views: int, patches: int, count: int, drawn: int)
 
     def points(record: Any, size: int):
         fields = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+        fields = {name: value for name, value in fields.items() if value is not None}
         more = {name: extended(value, size) for name, value in fields.items() if name != "points"}
         return type(record)(points=extended(record.points, size, repeat=0), **more)
 

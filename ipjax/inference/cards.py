@@ -88,7 +88,7 @@ def draw_card(estimate: PoseEstimate, info: ObjectInfo, evidence: Evidence | Non
     # Of a size that was given nothing was estimated: ± 0 would say that it is exact.
     spread = f" ± {1e3 * float(estimate.scale_std):.1f} mm" if float(estimate.scale_std) > 0 else " mm (given)"
     rows = [
-        ("diameter", f"{1e3 * float(pose.scale):.1f}{spread}"),
+        ("diameter", f"{1e3 * float(estimate.diameter):.1f}{spread}"),
         ("centre in camera", f"({centre}) mm"),
         ("inliers", f"{int(estimate.inliers)} pairs, rms {1e3 * float(estimate.rmse):.1f} mm"),
     ]

@@ -103,6 +103,7 @@ def draw(
         [pose for pose, s in zip(poses, shown, strict=True) if s],
         [info for info, s in zip(objects, shown, strict=True) if s],
         extents=None if extents is None else [e for e, s in zip(extents, shown, strict=True) if s],
+        boxes=[_own_box(e, info) for e, info, s in zip(estimates, objects, shown, strict=True) if s],
         colours=[PALETTE[i % len(PALETTE)] for i, s in enumerate(shown) if s],
         height=height,
     )
@@ -113,6 +114,12 @@ def draw(
     return attach_cards(photo, cards)
 
 
+def _own_box(estimate: PoseEstimate, info: ObjectInfo) -> np.ndarray | None:
+    """The box that was estimated, of an object from a photo without depth; any other's is that of its mesh."""
+    guessed = info.reference is not None and not info.reference.metric and info.reference.method != "elsewhere"
+    return np.asarray(estimate.box) if guessed else None
+
+
 def draw_overlay(
     rgb: UInt8[np.ndarray, "h w 3"],
     camera,
@@ -120,10 +127,13 @@ def draw_overlay(
     objects: Sequence[ObjectInfo],
     *,
     extents: Sequence[np.ndarray] | None = None,
+    boxes: Sequence[np.ndarray | None] | None = None,
     colours: Sequence[tuple[int, int, int]] = PALETTE,
     height: int | None = None,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """The photo with the outline, the axes and the 3-D box of every object at its pose (``camera_from_object``).
+
+    ``boxes`` are lowest and highest corners in model units, of objects whose box is not that of their mesh.
 
     Raises:
         ValueError: rgb is no uint8 image.
@@ -146,8 +156,9 @@ def draw_overlay(
     image = np.array(rgb)
     # Far objects first, so that near ones are drawn over them.
     for i in sorted(range(len(poses)), key=lambda i: -float(np.asarray(poses[i].translation)[2])):
-        box = None if extents is None else np.asarray(extents[i])
-        _draw_object(image, K, poses[i], objects[i], box, colours[i % len(colours)])
+        sides = None if extents is None else np.asarray(extents[i])
+        box = None if boxes is None else boxes[i]
+        _draw_object(image, K, poses[i], objects[i], sides, box, colours[i % len(colours)])
     return image
 
 
@@ -189,7 +200,7 @@ def _line(image: np.ndarray, a: np.ndarray, b: np.ndarray, colour, width: int, r
     cv2.line(image, start, end, colour, width, cv2.LINE_AA, 4)
 
 
-def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) -> None:
+def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, box, colour) -> None:
     camera_from_object = pose.to_numpy()
     height, width = image.shape[:2]
     stroke = max(round(height / 450), 1)
@@ -209,6 +220,8 @@ def _draw_object(image, K, pose: Similarity, info: ObjectInfo, extents, colour) 
         low, high = -np.asarray(extents) / 2, np.asarray(extents) / 2
     else:
         low = high = None
+    if box is not None:
+        low, high = np.asarray(box, np.float64)
     if low is not None and high is not None:
         corners = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)])
         placed = camera_from_object @ corners

@@ -4,6 +4,7 @@ The artifact takes and returns dictionaries of arrays. Templates are inputs, not
 object of the same shapes. The configuration is baked in.
 """
 
+import dataclasses
 import json
 import platform
 from datetime import UTC, datetime
@@ -34,6 +35,7 @@ _UNITS = {
     "templates.patches.points": "model units (diameters), object frame",
     "templates.camera_from_object.translation": "model units",
     "templates.photo_centre": "model units (diameters), object frame",
+    "templates.surface.along_std": "model units, standard deviation along the photo's ray",
     "templates.reference.patches.points": "model units (diameters), object frame",
     "templates.reference.camera_from_object.translation": "model units",
     "templates.reference.view.depth": "model units along z, 0 = unknown",
@@ -53,7 +55,13 @@ def to_dictionary(record: Any) -> dict[str, Any]:
     """A record of ``ipjax.records`` as nested dictionaries of arrays, by field name.
 
     Without the photo that serves only to choose among drawn candidates: exported graphs hold no encoder to draw with.
+    Of how far points of the surface may be off only what the graph uses, of objects from a photo without depth.
     """
+    if isinstance(record, Templates):
+        guessed = record.reference is not None and not record.reference.measured
+        along = record.surface.along_std if guessed else None
+        surface = dataclasses.replace(record.surface, along_std=along, across_std=None)
+        record = dataclasses.replace(record, surface=surface)
     fields = record.__dataclass_fields__
     values = {name: getattr(record, name) for name, field in fields.items() if not field.metadata.get("static")}
     present = {name: x for name, x in values.items() if x is not None and not getattr(x, "measured", False)}

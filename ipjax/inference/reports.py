@@ -26,6 +26,10 @@ CONVENTIONS = {
     "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter, "
     "or, for an object from a photo without depth, turned by less than 15 degrees; "
     "of method paper: the share of pairs that agree",
+    "size_mm": "expected diameter, its standard deviation, and the sides of the box along the object's axes; of an "
+    "object from a photo without depth with what this frame measured in place of the guess",
+    "guessed_size_mm": "of such an object, diameter and box as they were guessed: of its mesh at camera_from_mesh",
+    "box_of_object": "of such an object, lowest and highest corner of the box of size_mm, object coordinates",
     "covariance": "6 x 6, of rotation vector (rad, about the object's centre) and translation (m), camera axes",
     "ambiguity": "the object's axis about which it may be turned, and by how much (standard deviation)",
     "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
@@ -112,11 +116,18 @@ def estimate_as_json(estimate: PoseEstimate, templates: Templates, info: ObjectI
     entry["camera_from_object"] = pose_as_json(pose, "model_unit")
     if info.reference is not None:
         entry["camera_from_reference_camera"] = relative_pose_as_json(estimate.camera_from_object, info)
+    low, high = np.asarray(estimate.box)
     entry["size_mm"] = {
-        "diameter": 1e3 * float(pose.scale),
-        "box": [1e3 * float(pose.scale) * float(side) for side in np.asarray(templates.extents)],
+        "diameter": 1e3 * float(estimate.diameter),
+        "box": [1e3 * float(pose.scale) * float(side) for side in high - low],
         "diameter_std": 1e3 * float(estimate.scale_std),
     }
+    if templates.reference is not None and not templates.reference.measured:
+        entry["guessed_size_mm"] = {
+            "diameter": 1e3 * float(pose.scale),
+            "box": [1e3 * float(pose.scale) * float(side) for side in np.asarray(templates.extents)],
+        }
+        entry["box_of_object"] = {"low": low.tolist(), "high": high.tolist()}
     entry["covariance"] = np.asarray(estimate.covariance, np.float64).tolist()
     turn = np.asarray(estimate.ambiguity, np.float64)
     length = float(np.linalg.norm(turn))

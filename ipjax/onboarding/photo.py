@@ -16,6 +16,7 @@ from ipjax.files.cameras.reading import as_intrinsics, read_camera
 from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import read_depth, remove_sentinel
 from ipjax.files.images.masks import read_mask
+from ipjax.files.objects.deviations import with_deviations
 from ipjax.files.objects.record import GUESS_DEVIATION, ObjectInfo, Reference
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.encoder import load_encoder
@@ -126,6 +127,7 @@ def onboard_photo(
         progress=progress,
         backend=backend,
     )
+    templates = dataclasses.replace(templates, surface=with_deviations(templates.surface, method))
     if measured and reference is not None:
         view = describe_measured_photo(reference, made.mesh, templates, encoder, config, backend=backend)
         templates = dataclasses.replace(templates, reference=view)

@@ -21,6 +21,7 @@ from ipjax.config import OnboardConfig
 from ipjax.files.meshes.cleaning import clean
 from ipjax.files.meshes.loading import load_mesh
 from ipjax.files.meshes.mesh import Mesh, normalise
+from ipjax.files.objects.deviations import with_deviations
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.objects.saving import save
 from ipjax.files.weights.encoder import load_encoder
@@ -162,7 +163,7 @@ def mark_seen(
     *,
     backend: str = "auto",
 ) -> Templates:
-    """The templates, with what the photo saw as seen and where its camera stood.
+    """The templates, with what the photo saw as seen, how far each point may be off, and where its camera stood.
 
     A point was seen if it faces the photo's camera, lies in the mask, and nothing of the mesh is before it.
 
@@ -180,7 +181,7 @@ def mark_seen(
     return dataclasses.replace(
         templates,
         seen=jnp.asarray(share),
-        surface=Surface(surface.points, surface.normals, jnp.asarray(seen, jnp.float32)),
+        surface=with_deviations(Surface(surface.points, surface.normals, jnp.asarray(seen, jnp.float32)), "elsewhere"),
         photo_centre=jnp.asarray(centre, jnp.float32),
     )
 

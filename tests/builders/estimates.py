@@ -9,6 +9,8 @@ def make_estimate(pose: Similarity, *, success: bool = True, present: bool = Tru
     """``turn``: standard deviation about the object's z axis, rad."""
     return PoseEstimate(
         camera_from_object=pose,
+        diameter=pose.scale,
+        box=jnp.asarray([[-0.5, -0.4, -0.3], [0.5, 0.4, 0.3]]),
         confidence=jnp.asarray(0.8),
         present=jnp.asarray(present),
         covariance=jnp.diag(jnp.asarray([4e-4, 1e-4, 1e-4, 1e-6, 1e-6, 4e-6])),

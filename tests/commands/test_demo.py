@@ -101,8 +101,8 @@ def test_it_tells_of_the_mesh_and_of_the_photo(tmp_path, capfd, monkeypatch):
     assert shared < told.keys() and shared < told["photo"].keys()
     assert told["photo"]["true_diameter_mm"] == told["true_diameter_mm"]
     assert 25 <= told["photo"]["angle_deg"] <= 35 and told["photo"]["mask_iou"] > 0.9
-    assert told["photo"]["guessed_diameter_mm"] == pytest.approx(100)
-    assert told["photo"]["guessed_diameter_std_mm"] == pytest.approx(2)
+    assert told["photo"]["told_diameter_mm"] == pytest.approx(100)
+    assert told["photo"]["told_diameter_std_mm"] == pytest.approx(2)
     assert "by the mesh: off by" in text and "by the photo: off by" in text
     for name in ("photo.png", "photo_camera.json", "overlay.png", "photo_overlay.png", "bottle_photo.ipjax"):
         assert (tmp_path / name).is_file(), name

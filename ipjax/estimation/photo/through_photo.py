@@ -18,6 +18,7 @@ from ipjax.config import Config
 from ipjax.estimation.confidence import find_rival, probability, rotation_ambiguity
 from ipjax.estimation.features import object_features
 from ipjax.estimation.photo.drawing import compare_drawings, look_from_beside, splat_query
+from ipjax.estimation.photo.extent import centre_std, measure_extent
 from ipjax.estimation.photo.resection import (
     Look,
     match_photo,
@@ -94,10 +95,10 @@ def estimate_through_photo(
             units = jnp.full_like(units, diameter)
         poses = jax.vmap(lambda *one: query_from_object(reference, *one))(*camera, units, behind)
     order = lax.top_k(score, score.shape[0])[1]
-    everything = poses, camera, score, overlap, colour, shared, found.support, points, where, weight
+    everything = poses, camera, score, overlap, colour, shared, found.support, points, where, weight, depth, behind
     everything = jax.tree.map(lambda x: x[order], everything)
     (poses, _, score, *_), best = everything, jax.tree.map(lambda x: x[0], everything)
-    pose, camera, _, overlap, colour, shared, support, points, where, weight = best
+    pose, camera, _, overlap, colour, shared, support, points, where, weight, depth, behind = best
     success = usable & (score[0] >= 0)
     width = resection.width * sight.diagonal
     fit = refine_resection(*camera, points, where, weight, width, steps=0)
@@ -110,7 +111,16 @@ def estimate_through_photo(
     total = jnp.sum(weight)
     middle = jnp.sum(weight[:, None] * placed, axis=0) / jnp.where(total > 1e-12, total, 1)
     arm = jnp.matmul(camera[0], pose.translation, precision="highest") + camera[1] - middle
-    spread, scale_std = _spread(reference, camera[0], fit, arm, width, pose, config, scale_known=diameter is not None)
+    guess = centre_std(templates.surface, config.resect.guess)
+    spread, unit_std = _spread(reference, camera[0], fit, arm, width, pose, guess, config)
+    with jax.named_scope("extent"):
+        placed = Similarity(*camera, jnp.ones_like(pose.scale))
+        seen = reference, templates.surface, query, placed
+        extent = measure_extent(*seen, pose.scale, behind, depth, unit_std, config.resect.reach)
+    if diameter is None:
+        size, scale_std = jnp.where(success, extent.diameter, pose.scale), root(extent.variance)
+    else:
+        size, scale_std = diameter, jnp.zeros_like(unit_std)
     with jax.named_scope("confidence"):
         agreement = Agreement(
             depth=depth_agreement(templates.surface, scene.depth, scene.mask, scene.cloud.camera, pose, config.score),
@@ -126,6 +136,8 @@ def estimate_through_photo(
     apart = jnp.where(jnp.any(templates.patches.valid, axis=1), closeness(templates, pose), jnp.inf)
     return PoseEstimate(
         camera_from_object=pose,
+        diameter=size,
+        box=extent.box,
         confidence=confidence,
         present=success & (confidence >= config.confidence.least),
         covariance=spread,
@@ -155,11 +167,11 @@ def _spread(
     arm: Float[Array, "3"],
     width: Float[Array, ""],
     pose: Similarity,
+    guess: Float[Array, ""],
     config: Config,
-    *,
-    scale_known: bool,
 ) -> tuple[Float[Array, "6 6"], Float[Array, ""]]:
-    """The covariance of rotation (rad) and translation (metres) in the query's axes, and the scale's deviation.
+    """The covariance of rotation (rad) and translation (metres) in the query's axes, and the relative deviation of the
+    unit.
 
     Across the photo's ray the rays tell; along it, and with it in size, the guess is only as good as guesses are.
 
@@ -167,6 +179,7 @@ def _spread(
       turn: the photo's camera from the query's.
       arm: from the centre of the points that were fitted to the object's, metres, in the photo's camera.
       width: of the robust loss, rays.
+      guess: standard deviation of the distance from the measured front to the centre, model units.
     """
     scale, dtype = pose.scale, fit.information.dtype
     unit = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, scale, dtype)])
@@ -186,12 +199,10 @@ def _spread(
     zero = jnp.zeros_like(x)
     lever = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
     to_object = jnp.eye(6, dtype=dtype).at[3:, :3].set(lever)
-    of_guess = jnp.zeros((6, 6), dtype).at[5, 5].set(config.resect.guess**2)
+    of_guess = jnp.zeros((6, 6), dtype).at[5, 5].set(guess**2)
     moved = jnp.matmul(jnp.matmul(to_object, found, precision="highest"), to_object.T, precision="highest") + of_guess
     back = jnp.zeros((6, 6), dtype).at[:3, :3].set(turn.T).at[3:, 3:].set(turn.T) * unit[:, None]
     spread = jnp.matmul(jnp.matmul(back, moved, precision="highest"), back.T, precision="highest")
     spread = (spread + spread.T) / 2
-    if scale_known:
-        return spread, jnp.zeros_like(scale)
     distance = reference.camera_from_object.translation[2]
-    return spread, scale * root(config.resect.guess**2 + along) / distance
+    return spread, root(guess**2 + along) / distance

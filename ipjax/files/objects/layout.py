@@ -8,6 +8,7 @@ mesh, and a checksum. Tensors, for v templates of p patches with c channels, and
     points f32 [v p 3] · grid f32 [v p 2] · valid bool [v p] · seen f32 [v p]
     rotation f32 [v 3 3] · translation f32 [v 3] · focal, centre f32 [v 2]           camera_from_object and its camera
     surface.points, surface.normals f32 [n 3] · surface.seen f32 [n] · extents f32 [3] · axes f32 [3 3]
+    deviation.along, deviation.across f32 [n]                                        optional, of an object from a photo
     appearance.points, appearance.normals f16 [m 3] · appearance.colours u8 [m 3]    optional, to draw candidates from
     mesh.vertices f32 [a 3] · mesh.faces i32 [b 3] · mesh.colours u8 [a 3]           optional, for pictures
     pictures u8 [bytes] · pictures.end i64 [v]                                       optional, one JPEG per template
@@ -18,14 +19,19 @@ mesh, and a checksum. Tensors, for v templates of p patches with c channels, and
     reference.rotation f32 [3 3] · reference.translation f32 [3] · reference.focal, reference.centre f32 [2]
 
 Lengths are model units: the object's bounding box is centred at the origin and its diameter is 1. Of the tensors under
-``appearance.`` and of those under ``reference.`` a file holds all or none. The latter are the photo that the object was
-made from, as ``ipjax.records.ReferenceView`` has it: a square crop with the depth of the reconstruction's front, its
-patches in the object's frame, and ``camera_from_object`` with its camera. ``depth_measured`` in the metadata tells
-whether that depth was measured or guessed. ``photo`` is there for people, with or without them. Templates that were
-saved after ``ipjax.compact`` have fewer patches than the photo, which keeps all of its own.
+``appearance.``, ``deviation.`` and ``reference.`` a file holds all or none each. The last are the photo that the
+object was made from, as ``ipjax.records.ReferenceView`` has it: a square crop with the depth of the reconstruction's
+front, its patches in the object's frame, and ``camera_from_object`` with its camera. ``depth_measured`` in the metadata
+tells whether that depth was measured or guessed. ``photo`` is there for people, with or without them. Templates saved
+after ``ipjax.compact`` have fewer patches than the photo, which keeps all of its own.
+
+``deviation.`` tells how far each point of the surface may be off, along the ray of the photo's camera and across it
+(standard deviations, ``Surface.along_std`` and ``across_std``).
 
 Format 1 had no ``reference.`` tensors; its files are read as they are, and have no reference view. Format 2 had them of
-photos without depth only, and no ``depth_measured``. Neither had ``photo_centre``.
+photos without depth only, and no ``depth_measured``. Neither had ``photo_centre``. Up to format 3 nothing said how far
+points may be off: what is now assumed of the method that made the object is filled in when such a file is read
+(`ipjax.files.objects.deviations`).
 """
 
 import hashlib
@@ -34,8 +40,8 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 3  # the one written
-READABLE = (1, 2, FORMAT)
+FORMAT = 4  # the one written
+READABLE = (1, 2, 3, FORMAT)
 SUFFIX = ".ipjax"
 
 TEMPLATE_TENSORS = {
@@ -58,6 +64,8 @@ TEMPLATE_TENSORS = {
 }
 OPTIONAL_TENSORS = {
     "basis": ("float32", "fc"),
+    "deviation.along": ("float32", "n"),
+    "deviation.across": ("float32", "n"),
     "appearance.points": ("float16", "m3"),
     "appearance.normals": ("float16", "m3"),
     "appearance.colours": ("uint8", "m3"),
@@ -80,7 +88,7 @@ OPTIONAL_TENSORS = {
     "reference.focal": ("float32", "2"),
     "reference.centre": ("float32", "2"),
 }
-_WHOLE = ("appearance.", "reference.")  # a file holds all of these tensors or none
+_WHOLE = ("appearance.", "deviation.", "reference.")  # a file holds all of these tensors or none
 
 
 def hash_content(header: dict[str, Any], tensors: dict[str, np.ndarray]) -> str:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ipjax.estimation.features import identity_of
+from ipjax.files.objects.deviations import with_deviations
 from ipjax.files.objects.layout import FORMAT, READABLE, TEMPLATE_TENSORS, check_shapes, hash_content
 from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.storage.budget import check_budget, read_safetensors_header
@@ -63,9 +64,7 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
                 scale=jnp.ones(views, jnp.float32),
             ),
             camera=Camera(focal=device["focal"], centre=device["centre"]),
-            surface=Surface(
-                points=device["surface.points"], normals=device["surface.normals"], seen=device["surface.seen"]
-            ),
+            surface=_make_surface(tensors, info, path),
             extents=device["extents"],
             axes=device["axes"],
             basis=jnp.asarray(tensors["basis"]) if "basis" in tensors else None,
@@ -75,6 +74,18 @@ def load(path: str | Path, encoder: Any = None) -> tuple[Templates, ObjectInfo]:
         ),
         info,
     )
+
+
+def _make_surface(tensors: dict[str, np.ndarray], info: ObjectInfo, path: str | Path) -> Surface:
+    """The surface; of an object from a photo, whose file is too old to say it, with what is assumed of its method."""
+    names = ("surface.points", "surface.normals", "surface.seen")
+    surface = Surface(*(jnp.asarray(tensors[name]) for name in names))
+    if "deviation.along" not in tensors:
+        return surface if info.reference is None else with_deviations(surface, info.reference.method)
+    along, across = tensors["deviation.along"], tensors["deviation.across"]
+    if min(along.min(), across.min()) < 0:
+        raise ValueError(f"{path}: damaged: the surface's points have deviations below zero")
+    return dataclasses.replace(surface, along_std=jnp.asarray(along), across_std=jnp.asarray(across))
 
 
 def _usable_patches(tensors: dict[str, np.ndarray], prefix: str = "") -> np.ndarray:
@@ -218,7 +229,8 @@ def _read_tensors(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     except OSError as error:
         raise ValueError(f"{path}: cannot be read ({error.strerror or error})") from None
     placed = ("rotation", "translation", "focal", "centre")
-    needed = (*placed, "extents", "axes", "mean", "basis", "surface.points", *(f"reference.{name}" for name in placed))
+    needed = ("extents", "axes", "mean", "basis", "surface.points", "deviation.along", "deviation.across")
+    needed = (*placed, *needed, *(f"reference.{name}" for name in placed))
     for name in needed:
         if name in tensors and not np.isfinite(tensors[name]).all():
             raise ValueError(f"{path}: damaged: {name} has values that are not finite")

@@ -50,6 +50,8 @@ def save(path: str | Path, templates: Templates, info: ObjectInfo) -> Path:
     }
     if templates.basis is not None:
         tensors["basis"] = templates.basis
+    if templates.surface.along_std is not None and templates.surface.across_std is not None:
+        tensors |= {"deviation.along": templates.surface.along_std, "deviation.across": templates.surface.across_std}
     if templates.appearance is not None:
         tensors |= {
             "appearance.points": templates.appearance.points,

@@ -1,5 +1,7 @@
 """The mesh at its pose; of an object from a photo without depth, with the front that the query measured."""
 
+import dataclasses
+
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage, sparse
@@ -7,6 +9,7 @@ from scipy.sparse.linalg import splu
 
 from ipjax.cameras import project, unproject
 from ipjax.files.meshes.mesh import Mesh, make_mesh
+from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.estimator import Result
 from ipjax.inference.photos.drawing import draw_query_into_photo, fill_from_nearest
 from ipjax.records import PoseEstimate, Query, Templates
@@ -40,6 +43,21 @@ def pose_mesh(result: Result) -> Mesh:
     # The crop's camera is only turned.
     turn = result.estimate.camera_from_object.to_numpy().rotation @ pose.rotation.T
     return make_mesh(placed @ turn.T, info.faces, colours=info.colours)
+
+
+def correct_info(result: Result) -> ObjectInfo:
+    """What is known about the object, with the mesh that `pose_mesh` poses in place of the guessed one; model units.
+
+    The same where there is nothing to correct: no pose, no mesh, or no guess.
+    """
+    info, reference = result.info, result.templates.reference
+    guessed = reference is not None and not reference.measured
+    if not guessed or not bool(result.estimate.success) or info.vertices is None or info.faces is None:
+        return info
+    if not len(info.faces):
+        return info
+    vertices = result.estimate.camera_from_object.to_numpy().inverse() @ pose_mesh(result).vertices
+    return dataclasses.replace(info, vertices=vertices)
 
 
 def correct_front(

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ipjax.files.meshes.mesh import Mesh
+from ipjax.files.objects.deviations import deviations_of
 from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.pages import embed_image, render_page
 from ipjax.files.storage.writing import write_text
@@ -120,6 +121,14 @@ def _list_facts(templates: Templates, info: ObjectInfo, found: Findings) -> list
         guess = "" if info.reference.metric else " as it was guessed"
         rows.append(("seen in the photo", f"{info.reference.seen:.0%} of the surface{guess}"))
         rows.append(("camera of the photo", info.reference.describe_camera()))
+        off = deviations_of(info.reference.method)
+        rows.append(
+            (
+                "off along the photo’s ray",
+                f"by {off.front:.0%} of the diameter where the photo shows it, {off.back:.0%} behind; across it "
+                f"{off.across:.0%} (standard deviations, measured for objects made like this one)",
+            )
+        )
     rows.append(("texture", f"{found.texture:.1f} CIELAB units within small windows"))
     return rows
 

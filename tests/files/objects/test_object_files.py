@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from builders.objects import make_object, nan, rewrite, with_reference
 
+from ipjax.files.objects.deviations import METHODS, with_deviations
 from ipjax.files.objects.layout import FORMAT, OPTIONAL_TENSORS, hash_content
 from ipjax.files.objects.loading import check, load
-from ipjax.files.objects.record import ObjectInfo
+from ipjax.files.objects.record import ObjectInfo, Reference
 from ipjax.files.objects.saving import save
 from ipjax.inference.batching import compact
 from ipjax.records import Appearance
@@ -105,6 +106,64 @@ def test_files_of_format_2_have_photos_without_depth(photo_file):
     rewrite(photo_file, metadata=older)
     assert jax.tree.structure(load(photo_file)[0]) == jax.tree.structure(wanted)
     assert "format 2" in " ".join(check(photo_file))
+
+
+def test_how_far_points_may_be_off_comes_back(tmp_path):
+    templates, info = make_object()
+    wanted = dataclasses.replace(templates, surface=with_deviations(templates.surface, "inflate"))
+    again, _ = load(save(tmp_path / "a.ipjax", wanted, info))
+    np.testing.assert_array_equal(again.surface.along_std, wanted.surface.along_std)
+    np.testing.assert_array_equal(again.surface.across_std, wanted.surface.across_std)
+    rewrite(tmp_path / "a.ipjax", drop=["deviation.across"])
+    with pytest.raises(ValueError, match=r"deviation\.across is missing"):
+        load(tmp_path / "a.ipjax")
+    save(tmp_path / "a.ipjax", wanted, info)
+    rewrite(tmp_path / "a.ipjax", change={"deviation.along": lambda x: -x - 1})
+    with pytest.raises(ValueError, match="deviations below zero"):
+        load(tmp_path / "a.ipjax")
+
+
+@pytest.mark.parametrize("method", ["inflate", "depth", "triposr", "elsewhere", "of some other version"])
+def test_files_of_format_3_get_what_is_assumed_of_their_method(tmp_path, method):
+    """As an earlier ipjax wrote them: the default of the method; of scans, nothing."""
+    from safetensors.numpy import load_file
+
+    templates, info = make_object()
+    templates = eqx.tree_at(lambda t: t.surface.seen, templates, jnp.asarray([0.0, 1, 0, 1, 0, 1, 0.5]))
+    reference = Reference(
+        file="mug.jpg",
+        sha256="",
+        rotation=np.eye(3),
+        translation=np.array([0, 0, 1.0]),
+        scale=1.0,
+        focal=(500.0, 500.0),
+        centre=(50.0, 50.0),
+        size=(100, 100),
+        camera_source="given",
+        metric=method == "depth",
+        method=method,
+        seen=0.5,
+    )
+    for name, kept in (("photo", reference), ("scan", None)):
+        path = save(tmp_path / f"{name}.ipjax", templates, dataclasses.replace(info, reference=kept))
+        tensors = load_file(path)
+        assert not any("deviation" in one for one in tensors)
+
+        def older(text, tensors=tensors):
+            header = json.loads(text) | {"format": 3}
+            return json.dumps(header | {"content_sha256": hash_content(header, tensors)})
+
+        rewrite(path, metadata=older)
+        surface = load(path)[0].surface
+        assert check(path)
+        if kept is None:
+            assert surface.along_std is None and surface.across_std is None
+            continue
+        assert surface.along_std is not None and surface.across_std is not None
+        assumed = METHODS.get(method, METHODS["elsewhere"])
+        np.testing.assert_allclose(surface.along_std[:2], [assumed.back, assumed.front], rtol=1e-6)
+        np.testing.assert_allclose(surface.along_std[6], np.hypot(assumed.back, assumed.front) / 2**0.5, rtol=1e-6)
+        np.testing.assert_allclose(surface.across_std, assumed.across, rtol=1e-6)
 
 
 def test_compacted_templates_are_saved_beside_the_whole_photo(tmp_path):
