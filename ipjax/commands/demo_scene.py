@@ -24,6 +24,7 @@ from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.drawing import draw, gather_evidence, write_image
 from ipjax.inference.estimator import Estimator
+from ipjax.inference.photos.corrected_mesh import correct_info
 from ipjax.inference.reports import relative_pose
 from ipjax.networks.dinov2 import Encoder
 from ipjax.onboarding.foreground import ForegroundError
@@ -160,7 +161,7 @@ def run_demo(folder: str | Path, encoder: Encoder, *, seed: int = 0, config: Con
         seconds = ", ".join(f"{name} {value:.2f} s" for name, value in result.seconds.items())
         say(f"estimated by the {label} ({seconds})")
         evidence = gather_evidence(result.templates, result.query, result.crop_estimate, result.info, config)
-        write_image(picture, draw(scene.rgb, scene.matrix, result.estimate, result.info, evidence))
+        write_image(picture, draw(scene.rgb, scene.matrix, result.estimate, correct_info(result), evidence))
         estimates.append(result.estimate)
     found: list[Similarity | None] = [None, None]
     mesh_compared, photo_compared = None, None

@@ -9,6 +9,7 @@ from builders.objects import make_object, with_reference
 from builders.tiny_pipeline import TINY
 
 import ipjax
+from ipjax.files.objects.deviations import with_deviations
 from ipjax.inference.exporting import estimate_dictionaries, to_dictionary
 from ipjax.synthetic import problems
 
@@ -28,6 +29,15 @@ def test_reference_views_are_stacked():
         jax.tree.map(np.testing.assert_array_equal, found, one.reference)
     unnamed = dataclasses.replace(objects[1], patches=dataclasses.replace(objects[1].patches, encoder=None))
     assert ipjax.pad_templates([objects[0], unnamed]).reference.patches.encoder == "dinov2 vits14 block=8"
+
+
+def test_deviations_of_points_are_padded_where_all_objects_have_them():
+    objects = [with_reference(make_object(points=count, seed=count)[0]) for count in (7, 5)]
+    known = [dataclasses.replace(o, surface=with_deviations(o.surface, "inflate")) for o in objects]
+    surface = ipjax.pad_templates(known).surface
+    assert surface.along_std is not None and surface.along_std.shape == (2, 7)
+    np.testing.assert_array_equal(surface.along_std[1, :5], known[1].surface.along_std)
+    assert ipjax.pad_templates([known[0], objects[1]]).surface.along_std is None
 
 
 def test_compact_leaves_the_reference_view_whole():
@@ -90,6 +100,13 @@ def test_photos_with_depth_are_padded_only_beside_their_like():
     assert ipjax.pad_templates([first, dataclasses.replace(second, reference=None)]).reference is None
     with pytest.raises(ValueError, match=r"from a photo without depth, .* and some were not"):
         ipjax.pad_templates([first, two_photos()[1]])
+
+
+def test_an_exported_graph_takes_deviations_of_photos_without_depth_only():
+    guessed = with_reference(problems.make_templates(), side=112)
+    guessed = dataclasses.replace(guessed, surface=with_deviations(guessed.surface, "inflate"))
+    assert set(to_dictionary(guessed)["surface"]) == {"points", "normals", "seen", "along_std"}
+    assert set(to_dictionary(measured(guessed))["surface"]) == {"points", "normals", "seen"}
 
 
 def test_an_exported_graph_leaves_out_a_photo_with_depth():

@@ -18,6 +18,7 @@ from PIL import Image
 from ipjax import cli
 from ipjax.config import OnboardConfig
 from ipjax.files.cameras.intrinsics import Intrinsics
+from ipjax.files.objects.deviations import deviations_of
 from ipjax.files.objects.loading import check, load
 from ipjax.files.objects.record import GUESS_DEVIATION, Reference
 from ipjax.files.objects.saving import save
@@ -84,6 +85,18 @@ def test_a_photo_with_depth_makes_an_object_in_metres(metric, tmp_path):
     assert again.as_json() == reference.as_json() and again.picture == reference.picture
     assert Image.open(io.BytesIO(again.picture)).size == (WIDTH, HEIGHT)
     assert any("made from the photo by depth" in line for line in check(path))
+
+
+def test_points_say_how_far_they_may_be_off(metric, upright):
+    """More behind than where the photo shows the object, and more without depth than with it."""
+    for made, method in ((metric, "depth"), (upright, "inflate")):
+        surface, off = made.templates.surface, deviations_of(method)
+        seen, along = np.asarray(surface.seen), np.asarray(surface.along_std)
+        assert made.info.reference.method == method and (seen == 1).any() and (seen == 0).any()
+        np.testing.assert_allclose(along[seen == 1], off.front, rtol=1e-5)
+        np.testing.assert_allclose(along[seen == 0], off.back, rtol=1e-5)
+        np.testing.assert_allclose(surface.across_std, off.across, rtol=1e-5)
+    assert deviations_of("depth").front < deviations_of("inflate").front < deviations_of("inflate").back
 
 
 def test_objects_made_from_meshes_have_no_reference(tmp_path):

@@ -14,6 +14,7 @@ from builders.tiny_pipeline import TINY, estimate
 import ipjax
 from ipjax.config import OnboardConfig
 from ipjax.files.meshes.mesh import make_mesh
+from ipjax.files.objects.deviations import deviations_of
 from ipjax.files.objects.loading import load
 from ipjax.inference.frames import frame
 from ipjax.inference.reports import relative_pose
@@ -79,6 +80,9 @@ def test_what_the_photo_saw_is_what_faces_it():
     assert set(np.unique(seen)) == {0.0, 1.0}
     assert (seen[facing < 0.0] == 0).mean() > 0.99 and (seen[facing > 0.4] == 1).mean() > 0.99
     assert info.reference.seen == pytest.approx(seen.mean())
+    off = deviations_of("elsewhere")
+    np.testing.assert_allclose(surface.along_std, np.where(seen == 1, off.front, off.back), rtol=1e-5)
+    np.testing.assert_allclose(surface.across_std, off.across, rtol=1e-5)
     eye = -true.rotation.T @ (true.translation / true.scale)
     cosine = eye @ np.asarray(templates.photo_centre) / np.linalg.norm(eye) / np.linalg.norm(templates.photo_centre)
     assert cosine > np.cos(np.deg2rad(3))
