@@ -47,11 +47,10 @@ def measure_extent(
     what the query measured.
 
     How much farther the back reaches than guessed is one normal number, of ``share`` the deviation that each of its
-    points has. The diameter's mean and variance are taken from three values of it (Gauss and Hermite's rule: as
-    guessed, and √3 deviations nearer and farther, which count a sixth each): with D the diameter as guessed and a, b
-    what the other two add to it,
+    points has. With D the diameter as guessed, and D + dᵢ that with the back by xᵢ deviations farther away, Gauss and
+    Hermite's rule of five such xᵢ and their weights wᵢ gives
 
-        mean = D + (a + b) / 6,   variance = (a² + b²) / 6 − (a + b)² / 36 + (ε e)² + (``EXACT`` D)².
+        mean = D + Σ wᵢ dᵢ,   variance = Σ wᵢ dᵢ² − (Σ wᵢ dᵢ)² + (ε e)² + (``EXACT`` D)².
 
     So what is guessed counts for nothing where the ends of the diameter were measured and no guess reaches beyond
     them, and most where the diameter lies along the photo's ray. ε is the unit's relative deviation, and e how far the
@@ -80,12 +79,15 @@ def measure_extent(
     own = jnp.where(used[:, None], own, guess[:1])
 
     along = jnp.zeros_like(measured) if surface.along_std is None else unit * surface.along_std
-    back = 3**0.5 * share * jnp.where(surface.seen > 0.5, 0, along)[:, None] * rays
+    back = share * jnp.where(surface.seen > 0.5, 0, along)[:, None] * rays
     ends = _ends(own)
     spread = lambda points: _farthest(_ends(points), ends)
     first, second, length = spread(guess)
-    near, far = (spread(guess + way * back)[2] - length for way in (-1, 1))
-    variance = (near**2 + far**2) / 6 - (near + far) ** 2 / 36
+    places, weights = np.polynomial.hermite_e.hermegauss(5)
+    added = jnp.stack([spread(guess + float(place) * back)[2] - length for place in places])
+    weights = jnp.asarray(weights / weights.sum(), added.dtype)
+    more = jnp.sum(weights * added)
+    variance = jnp.sum(weights * added**2) - more**2
     # Which of the two ends are guessed, and how far a change of the unit moves them apart.
     every, loose = jnp.concatenate([guess, own]), jnp.concatenate([~known, jnp.zeros_like(used)])
     lever = lambda index: jnp.where(loose[index], every[index] - centre, 0)
@@ -93,7 +95,7 @@ def measure_extent(
     inside = jnp.matmul((every - ahead) / unit - pose.translation, pose.rotation, precision="highest")
     box = jnp.stack([jnp.min(inside, axis=0), jnp.max(inside, axis=0)])
     variance = jnp.maximum(variance, 0) + (unit_std * apart) ** 2 + (EXACT * length) ** 2
-    return Extent(length + (near + far) / 6, variance, box)
+    return Extent(length + more, variance, box)
 
 
 def _query_points(
