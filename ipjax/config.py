@@ -112,7 +112,7 @@ class ResectConfig(eqx.Module):
     # say how far its points may be off.
     guess: float = 0.1
     # By which share of that of its points the whole back may be off; fitted to sizes of rendered pairs (seeds 1 and 7).
-    reach: float = 0.6
+    reach: float = 0.8
     independent: float = 20.0  # number of independent pairs; not fitted to real images
     noise: float = 0.15  # standard deviation of a match that fits perfectly, patches
 

@@ -26,7 +26,7 @@ CONVENTIONS = {
     "confidence": "probability that the pose is right: surface points on average within a tenth of the diameter, "
     "or, for an object from a photo without depth, turned by less than 15 degrees; "
     "of method paper: the share of pairs that agree",
-    "size_mm": "expected diameter, its standard deviation, and the sides of the box along the object's axes; of an "
+    "size_mm": "diameter, its standard deviation, and the sides of the box along the object's axes; of an "
     "object from a photo without depth with what this frame measured in place of the guess",
     "guessed_size_mm": "of such an object, diameter and box as they were guessed: of its mesh at camera_from_mesh",
     "box_of_object": "of such an object, lowest and highest corner of the box of size_mm, object coordinates",

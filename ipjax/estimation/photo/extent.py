@@ -27,7 +27,7 @@ DIRECTIONS = 128  # along which the object's ends are sought
 class Extent(eqx.Module):
     """Size and box of the object, and how far the size may be off for what of it is guessed."""
 
-    diameter: Float[Array, ""]  # expected, metres
+    diameter: Float[Array, ""]  # metres
     variance: Float[Array, ""]  # of it, metres²
     box: Float[Array, "2 3"]  # lowest and highest corner, along the object's axes, model units
 
@@ -47,10 +47,10 @@ def measure_extent(
     what the query measured.
 
     How much farther the back reaches than guessed is one normal number, of ``share`` the deviation that each of its
-    points has. With D the diameter as guessed, and D + dᵢ that with the back by xᵢ deviations farther away, Gauss and
-    Hermite's rule of five such xᵢ and their weights wᵢ gives
+    points has. With D the diameter, and D + dᵢ what it is with the back by xᵢ deviations farther away, Gauss and
+    Hermite's rule of five such xᵢ and their weights wᵢ gives the mean square by which the true one differs from it,
 
-        mean = D + Σ wᵢ dᵢ,   variance = Σ wᵢ dᵢ² − (Σ wᵢ dᵢ)² + (ε e)² + (``EXACT`` D)².
+        variance = Σ wᵢ dᵢ² + (ε e)² + (``EXACT`` D)².
 
     So what is guessed counts for nothing where the ends of the diameter were measured and no guess reaches beyond
     them, and most where the diameter lies along the photo's ray. ε is the unit's relative deviation, and e how far the
@@ -86,16 +86,14 @@ def measure_extent(
     places, weights = np.polynomial.hermite_e.hermegauss(5)
     added = jnp.stack([spread(guess + float(place) * back)[2] - length for place in places])
     weights = jnp.asarray(weights / weights.sum(), added.dtype)
-    more = jnp.sum(weights * added)
-    variance = jnp.sum(weights * added**2) - more**2
+    variance = jnp.sum(weights * added**2)
     # Which of the two ends are guessed, and how far a change of the unit moves them apart.
     every, loose = jnp.concatenate([guess, own]), jnp.concatenate([~known, jnp.zeros_like(used)])
     lever = lambda index: jnp.where(loose[index], every[index] - centre, 0)
     apart = jnp.sum((lever(first) - lever(second)) * (every[first] - every[second])) / jnp.maximum(length, 1e-9)
     inside = jnp.matmul((every - ahead) / unit - pose.translation, pose.rotation, precision="highest")
     box = jnp.stack([jnp.min(inside, axis=0), jnp.max(inside, axis=0)])
-    variance = jnp.maximum(variance, 0) + (unit_std * apart) ** 2 + (EXACT * length) ** 2
-    return Extent(length + more, variance, box)
+    return Extent(length, variance + (unit_std * apart) ** 2 + (EXACT * length) ** 2, box)
 
 
 def _query_points(
@@ -114,7 +112,7 @@ def _query_points(
     near = max(1, round(RIM * view.mask.shape[1]))
     known = measured_surface(query).astype(view.depth.dtype)
     window = (2 * near + 1, 2 * near + 1)
-    add = lambda x: lax.reduce_window(x, jnp.zeros((), x.dtype), lax.add, window, (1, 1), "SAME")
+    add = lambda x: lax.reduce_window(x, np.zeros((), x.dtype), lax.add, window, (1, 1), "SAME")
     count = add(known)
     mean = add(known * view.depth) / jnp.maximum(count, 1)
     points = camera_from_query @ point_map(view.camera, mean)[::STEP, ::STEP].reshape(-1, 3)

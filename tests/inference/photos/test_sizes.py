@@ -46,7 +46,8 @@ def test_the_diameter_leans_to_no_side_and_is_as_exact_as_it_says(told):
     print(f"{mean} ± {error}, guess {guessed.mean():.3f} ± {guessed.std():.3f}, {off.std():.3f}", deviations.round(1))
     assert np.abs(mean[0]) < max(3 * error[0], 0.01)
     assert np.sqrt(np.mean(off**2)) < np.sqrt(np.mean(guessed**2))
-    assert abs(deviations.mean()) < 1
+    # Seen end-on in the photo and in the query, the longest axis shows in neither: those are told too short.
+    assert -1.2 < deviations.mean() < 0.5
     assert np.mean(np.abs(deviations) < 1) > 0.5
 
 
