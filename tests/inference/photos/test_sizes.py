@@ -16,7 +16,8 @@ ANGLES = (10, 20, 30, 40)
 
 @pytest.fixture(scope="module")
 def told():
-    """Of twenty-four photos a query each, found as users find them: what is told, the result, and the true diameter."""
+    """Of twenty-four photos a query each, found as users find them: what is told, the result, the true diameter,
+    and the cosine between longest axis and photo's ray."""
     rows, estimator = [], Estimator([], ENCODER, CONFIG)
     for seed in range(24):
         pair = make_photo_pair(seed, ANGLES[seed % len(ANGLES)])
@@ -26,34 +27,40 @@ def told():
         entry = estimate_as_json(result.estimate, result.templates, result.info)
         relative = (
             result.crop_estimate.camera_from_object.to_numpy().rotation
-            @ pair.templates.reference.camera_from_object.to_numpy().rotation.T
+            @ pair.reference.camera_from_object.to_numpy().rotation.T
         )
         true = pair.crop_from_ellipsoid.rotation @ pair.photo_from_ellipsoid.rotation.T
         turned = np.degrees(np.arccos(np.clip((np.trace(relative.T @ true) - 1) / 2, -1, 1)))
         if entry["success"] and turned < 15:
-            rows.append((entry, result, 1e3 * float(frame.camera_from_object.scale)))
+            # How far the longest axis lies along the photo's ray.
+            along = abs(float(pair.photo_from_ellipsoid.rotation[2, 2]))
+            rows.append((entry, result, 1e3 * float(frame.camera_from_object.scale), along))
     assert len(rows) >= 20
     return rows
 
 
 def test_the_diameter_leans_to_no_side_and_is_as_exact_as_it_says(told):
-    off = np.array([entry["size_mm"]["diameter"] / true - 1 for entry, _, true in told])
-    guessed = np.array([entry["guessed_size_mm"]["diameter"] / true - 1 for entry, _, true in told])
+    off = np.array([entry["size_mm"]["diameter"] / true - 1 for entry, _, true, _ in told])
+    guessed = np.array([entry["guessed_size_mm"]["diameter"] / true - 1 for entry, _, true, _ in told])
     deviations = np.array(
-        [(entry["size_mm"]["diameter"] - true) / entry["size_mm"]["diameter_std"] for entry, _, true in told]
+        [(entry["size_mm"]["diameter"] - true) / entry["size_mm"]["diameter_std"] for entry, _, true, _ in told]
     )
-    mean, error = summary(off[:, None])
-    print(f"{mean} ± {error}, guess {guessed.mean():.3f} ± {guessed.std():.3f}, {off.std():.3f}", deviations.round(1))
+    across = np.array([along < 0.7 for *_, along in told])
+    mean, error = summary(off[across, None])
+    print(across.sum(), mean, error, off.round(3), guessed.round(3), deviations.round(1))
+    assert across.sum() >= 8
     assert np.abs(mean[0]) < max(3 * error[0], 0.01)
+    assert np.abs(off[across]).max() < 0.1 and abs(deviations[across].mean()) < 0.75
+    assert np.mean(np.abs(deviations[across]) < 1) > 0.68
+    # Seen end-on in the photo and nearly so in the query, the longest axis shows in neither: it is told too short, by
+    # one deviation in the mean of all.
     assert np.sqrt(np.mean(off**2)) < np.sqrt(np.mean(guessed**2))
-    # Seen end-on in the photo and in the query, the longest axis shows in neither: those are told too short.
-    assert -1.2 < deviations.mean() < 0.5
-    assert np.mean(np.abs(deviations) < 1) > 0.5
+    assert -1.2 < deviations.mean() < 0.5 and np.mean(np.abs(deviations) < 1) > 0.5
 
 
 def test_the_box_is_that_of_the_corrected_mesh_and_of_what_was_measured(told):
     """Along each of the object's axes no shorter than the mesh that is written, nor much longer than the true one."""
-    for entry, result, true in told:
+    for entry, result, true, _ in told:
         mesh = correct_info(result).vertices
         assert mesh is not None
         low, high = np.array(entry["box_of_object"]["low"]), np.array(entry["box_of_object"]["high"])
