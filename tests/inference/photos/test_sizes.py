@@ -50,7 +50,7 @@ def test_the_diameter_leans_to_no_side_and_is_as_exact_as_it_says(told):
     print(across.sum(), mean, error, off.round(3), guessed.round(3), deviations.round(1))
     assert across.sum() >= 8
     assert np.abs(mean[0]) < max(3 * error[0], 0.01)
-    assert np.abs(off[across]).max() < 0.1 and abs(deviations[across].mean()) < 0.75
+    assert np.abs(deviations[across]).max() < 2.5 and abs(deviations[across].mean()) < 0.75
     assert np.mean(np.abs(deviations[across]) < 1) > 0.68
     # Seen end-on in the photo and nearly so in the query, the longest axis shows in neither: it is told too short, by
     # one deviation in the mean of all.
