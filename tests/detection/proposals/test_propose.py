@@ -1,6 +1,5 @@
 """Proposals cover what is seen, whatever the frame's size and however much of its depth is missing."""
 
-
 import numpy as np
 import pytest
 from builders.tables import BLUE, RED, THREE, table_frame
