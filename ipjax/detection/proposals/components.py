@@ -73,9 +73,10 @@ def find_basins(
     found = []
     for level in levels:
         count, labels, stats, _ = cv2.connectedComponentsWithStats((height < level).view(np.uint8), connectivity=4)
-        labels[stats[labels, cv2.CC_STAT_AREA] < least // 3] = 0
+        area = stats[:, cv2.CC_STAT_AREA]
+        labels = np.where(area[np.asarray(labels, np.int32)] < least // 3, 0, labels).astype(np.int32)
         grown = watershed(height, labels)
         for label in np.flatnonzero(np.bincount(grown.reshape(-1), minlength=count) >= least):
-            if label and stats[label, cv2.CC_STAT_AREA] >= least // 3:
+            if label and area[label] >= least // 3:
                 found.append(grown == label)
     return np.array(found, bool).reshape(-1, *surfaces.shape)

@@ -125,8 +125,10 @@ def measure_masks(
         rim = mask[0].sum() + mask[-1].sum() + mask[:, 0].sum() + mask[:, -1].sum()
         rows.append((len(crossed), total, rim, inner, per_pixel[mask.reshape(-1)].sum(0)))
     shapes = ((), (5,), (), (2,), (per_pixel.shape[1],))
-    columns = [np.array([r[k] for r in rows], float).reshape(-1, *shape) for k, shape in enumerate(shapes)]
-    return _describe(*columns, surfaces)
+    length, total, rim, inner, moments = (
+        np.array([r[k] for r in rows], float).reshape(-1, *shape) for k, shape in enumerate(shapes)
+    )
+    return _describe(length, total, rim, inner, moments, surfaces)
 
 
 def find_ends(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

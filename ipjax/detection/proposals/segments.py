@@ -36,7 +36,7 @@ def make_segments(surfaces: Surfaces, count: int, compactness: float) -> Segment
         inverse = inverse / np.median(inverse[surfaces.trusted])
     features = np.concatenate(
         [
-            surfaces.lab / 100 * np.float32([0.7, 1.3, 1.3]),
+            surfaces.lab / 100 * np.array([0.7, 1.3, 1.3], np.float32),
             0.25 * surfaces.normals * trusted,
             2 * np.clip(inverse, 0, 4)[..., None] * trusted,
         ],

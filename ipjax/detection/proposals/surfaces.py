@@ -44,7 +44,7 @@ def make_surfaces(
     camera = resize(camera, before, (width, height))
     shrinks = width < before[0]
     rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    lab = cv2.cvtColor(np.float32(rgb) / 255, cv2.COLOR_RGB2Lab)
+    lab = cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)
     depth = _shrink_depth(depth, width, height)
     known = depth > 0
     filled, distance = _fill(depth)

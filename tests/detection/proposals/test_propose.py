@@ -23,8 +23,8 @@ def iou(one, other):
 @pytest.fixture(scope="module")
 def three():
     """A frame of three blocks, its proposals and the true masks."""
-    *frame, masks = table_frame(THREE)
-    return frame, propose(*frame), masks
+    rgb, depth, matrix, masks = table_frame(THREE)
+    return (rgb, depth, matrix), propose(rgb, depth, matrix), masks
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_a_second_resolution_finds_what_is_small():
 
 def test_a_known_diameter_leaves_out_what_is_longer(three):
     frame, anything, masks = three
-    small = propose(*frame, ProposalConfig(diameters=(0.2,)))
+    small = propose(*frame, config=ProposalConfig(diameters=(0.2,)))
     reach = lambda found: max(np.ptp(np.stack(np.nonzero(mask)), axis=1).max() for mask in found.masks) / 300
     assert reach(small) < 1.6 * 0.2 < reach(anything)  # pixels that are a metre away
     assert best_overlaps(small, masks)[1] >= 0.8
