@@ -57,7 +57,7 @@ def close(depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     from scipy import ndimage
 
     known = depth > 0
-    mask = ndimage.binary_closing(np.pad(known, 3), iterations=2)[3:-3, 3:-3] | known
+    mask = np.asarray(ndimage.binary_closing(np.pad(known, 3), iterations=2), bool)[3:-3, 3:-3] | known
     nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     return np.where(mask, depth[tuple(np.asarray(nearest))], 0)
 
@@ -75,7 +75,8 @@ def compare(
     both = (images[0][0] > 0) & (images[1][0] > 0)
     unit = float(np.median(images[1][0][both] / images[0][0][both]))
     front, back = (images[0][i][both] - images[1][i][both] / unit for i in range(2))
-    edges = [x & ~ndimage.binary_erosion(x) for x in (ndimage.binary_closing(one[0] > 0) for one in images)]
+    filled = [np.asarray(ndimage.binary_closing(one[0] > 0), bool) for one in images]
+    edges = [x & ~np.asarray(ndimage.binary_erosion(x), bool) for x in filled]
     apart = np.asarray(ndimage.distance_transform_edt(~edges[1]))[edges[0]]
     apart = apart / matrix[0, 0] * np.median(images[0][0][both])
     rms = lambda x: float(np.sqrt(np.mean(x**2)))

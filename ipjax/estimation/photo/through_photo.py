@@ -114,9 +114,9 @@ def estimate_through_photo(
     guess = centre_std(templates.surface, config.resect.guess)
     spread, unit_std = _spread(reference, camera[0], fit, arm, width, pose, guess, config)
     with jax.named_scope("extent"):
-        placed = Similarity(*camera, jnp.ones_like(pose.scale))
-        seen = reference, templates.surface, query, placed
-        extent = measure_extent(*seen, pose.scale, behind, depth, unit_std, config.resect.reach)
+        placed = Similarity(camera[0], camera[1], jnp.ones_like(pose.scale))
+        surface, share = templates.surface, config.resect.reach
+        extent = measure_extent(reference, surface, query, placed, pose.scale, behind, depth, unit_std, share)
     if diameter is None:
         size, scale_std = jnp.where(success, extent.diameter, pose.scale), root(extent.variance)
     else:

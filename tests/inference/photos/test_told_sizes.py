@@ -46,7 +46,7 @@ def test_the_diameter_leans_to_no_side_and_is_as_exact_as_it_says(told):
         [(entry["size_mm"]["diameter"] - true) / entry["size_mm"]["diameter_std"] for entry, _, true, _ in told]
     )
     across = np.array([along < 0.7 for *_, along in told])
-    mean, error = summary(off[across, None])
+    mean, error = summary(list(off[across, None]))
     print(across.sum(), mean, error, off.round(3), guessed.round(3), deviations.round(1))
     assert across.sum() >= 8
     assert np.abs(mean[0]) < max(3 * error[0], 0.01)
