@@ -182,6 +182,24 @@ class Config(eqx.Module):
         )
 
 
+class DetectConfig(eqx.Module):
+    """Finding objects without a mask (`ipjax.Detector`)."""
+
+    views: int = _static(128, least=1)  # templates of each object, the farthest apart, that poses are sought with
+    zoom: int = _static(2, least=1)  # all proposals are first described at 1 / this of a crop's size
+    alike: int = _static(3, least=1)  # templates whose similarity to a crop is averaged
+    colour: float = 0.5  # weight of colours beside whole features and features by cells, which have 1 each
+    verified: int = _static(4, least=1)  # proposals whose pose is estimated, of each object; two more for each instance
+    mended: int = _static(2, least=1)  # of their poses that give a mask, in which it is estimated again; likewise
+    same: float = 0.1  # poses whose surfaces lie on average within this, in diameters, are of one instance
+    tolerance: float = 0.05  # depth off the posed object's by more than this is not the object's; diameters
+    least_tolerance: float = 0.008  # metres: the same, for small objects
+    guessed_tolerance: float = 0.15  # diameters: the same, for shapes guessed from a photo
+    taken: float = 0.5  # share of the smaller of two masks beyond which they are of one thing
+    size_deviation: float = 0.08  # of the logarithm of a size that was found, where the true one is known
+    instances: int = _static(8, least=1)  # most instances of an object where all are asked for
+
+
 PRESETS = ("default", "fast", "paper")
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from ipjax.records import Templates
 
@@ -83,12 +84,58 @@ def pad_templates(objects: Sequence[Templates]) -> Templates:
     if not all(o.reference is not None and o.reference.measured for o in objects):
         objects = [_without_measured_photo(o) for o in objects]
     _check_references(objects)
+    padded = _pad_all(objects)
+    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
+    return _described_by(stacked, encoders[0] if encoders else None)
+
+
+def pad_alike(objects: Sequence[Templates]) -> list[Templates]:
+    """Each object's templates as `pad_templates` pads them, but apart, so that one compiled ``estimate`` takes each.
+
+    Objects that cannot be made alike (some with a basis, appearance or reference view and some without, or of
+    different encoders) are padded to the size of those that are like them.
+    """
+    kinds: dict[Any, list[int]] = {}
+    for index, one in enumerate(objects):
+        reference = None if one.reference is None else jax.tree.map(np.shape, one.reference)
+        has = tuple(getattr(one, name) is None for name in ("basis", "appearance", "photo_centre"))
+        leaves, structure = jax.tree.flatten((reference, one.patches.features.shape[-1]))
+        kinds.setdefault((has, tuple(leaves), structure, *_encoders(one)), []).append(index)
+    padded = list(objects)
+    for mine in kinds.values():
+        for index, one in zip(mine, _pad_all([objects[i] for i in mine]), strict=True):
+            padded[index] = one
+    return padded
+
+
+def thin_templates(templates: Templates, count: int) -> tuple[Templates, Int[np.ndarray, "k"]]:
+    """The ``count`` templates whose viewpoints and rolls are farthest apart, and their places in the old order.
+
+    Raises ValueError unless ``count`` is positive. With as many templates as there are, nothing changes.
+    """
+    if count < 1:
+        raise ValueError(f"at least one template must be kept, not {count}")
+    rotation = np.asarray(templates.camera_from_object.rotation, np.float64)
+    if count >= len(rotation):
+        return templates, np.arange(len(rotation))
+    chosen = [0]
+    nearest = np.einsum("nij,ij->n", rotation, rotation[0])  # the trace of the turn between two: large = near
+    while len(chosen) < count:
+        chosen.append(int(np.argmin(nearest)))
+        nearest = np.maximum(nearest, np.einsum("nij,ij->n", rotation, rotation[chosen[-1]]))
+    kept = np.sort(chosen)
+    parts = ("patches", "norm", "seen", "camera_from_object", "camera")
+    return dataclasses.replace(
+        templates, **{name: jax.tree.map(lambda x: x[kept], getattr(templates, name)) for name in parts}
+    ), kept
+
+
+def _pad_all(objects: Sequence[Templates]) -> list[Templates]:
+    """All padded to the size of the largest."""
     views, patches = (max(o.norm.shape[axis] for o in objects) for axis in (0, 1))
     count = max(o.surface.points.shape[0] for o in objects)
     drawn = max(0 if o.appearance is None else o.appearance.points.shape[0] for o in objects)
-    padded = [_pad(o, views, patches, count, drawn) for o in objects]
-    stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(one, jnp.result_type(*x)) for one in x]), *padded)
-    return _described_by(stacked, encoders[0] if encoders else None)
+    return [_pad(o, views, patches, count, drawn) for o in objects]
 
 
 def _check_references(objects: list[Templates]) -> None:

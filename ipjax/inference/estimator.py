@@ -13,7 +13,7 @@ from ipjax.config import Config
 from ipjax.estimation.features import describe
 from ipjax.estimation.pipeline import estimate
 from ipjax.files.objects.record import ObjectInfo
-from ipjax.inference.batching import compact
+from ipjax.inference.batching import compact, pad_alike
 from ipjax.inference.frames import frame_turned
 from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
 
@@ -50,6 +50,8 @@ class Estimator:
         encoder: made the templates' features.
         config: of the estimate.
         quick: compile with `QUICK` on a CPU, for one frame or a few.
+        alike: pad the objects to one size (`ipjax.pad_templates`), so that what was compiled for one serves all; not
+            those that are added later.
         options: of `ipjax.inference.frames.frame_turned`; "square" crops by default.
     """
 
@@ -60,6 +62,7 @@ class Estimator:
         config: Config = Config(),
         *,
         quick: bool = False,
+        alike: bool = False,
         **options: Any,
     ):
         self.objects = list(objects)
@@ -69,6 +72,10 @@ class Estimator:
         self.options: dict[str, Any] = {"crop": "square"} | options
         self._compiled: dict[Any, Any] = {}
         self._compacted: dict[int, Templates] = {}
+        if alike:
+            padded = pad_alike([compact(templates, multiple=MULTIPLE) for templates, _ in self.objects])
+            self.objects = [(one, info) for one, (_, info) in zip(padded, self.objects, strict=True)]
+            self._compacted = dict(enumerate(padded))
 
     def frame(self, index: int, rgb: Any, depth: Any, mask: Any, camera: Any, box: Any = None):
         """The crop of one object; bad input is refused here, before anything is described.
@@ -108,14 +115,14 @@ class Estimator:
 
         described: Any = patches
         if described is None:
-            describe_compiled = self._compile("describe", describe, seconds, self.encoder, view)
+            describe_compiled = self.compiled("describe", describe, seconds, self.encoder, view)
             start = time.perf_counter()
             described = jax.block_until_ready(describe_compiled(self.encoder, view))
             seconds["describe"] = time.perf_counter() - start
 
         query = Query(patches=described, view=view)
         arguments = self.encoder, templates, query, key, self.config, known
-        estimate_compiled = self._compile("estimate", estimate, seconds, *arguments)
+        estimate_compiled = self.compiled("estimate", estimate, seconds, *arguments)
         start = time.perf_counter()
         found = jax.block_until_ready(estimate_compiled(*arguments))
         seconds["estimate"] = time.perf_counter() - start
@@ -124,7 +131,8 @@ class Estimator:
         whole = to_image_camera(camera_from_crop, found)
         return Result(whole, found, query, templates, info, seconds, warnings)
 
-    def _compile(self, name: str, function: Any, seconds: dict[str, float], *args: Any):
+    def compiled(self, name: str, function: Any, seconds: dict[str, float], *args: Any) -> Any:
+        """A function compiled for arguments of these shapes, once; what that takes is added to ``seconds``."""
         leaves, structure = jax.tree.flatten(args)
         shapes = tuple((np.shape(x), str(getattr(x, "dtype", type(x)))) for x in leaves)
         key = (name, structure, shapes)

@@ -170,12 +170,53 @@ def frame_turned(
         mask = inside
         if not mask.any():
             raise ValueError("the mask is empty inside the box")
-    mask, bounds = drop_specks(np.ascontiguousarray(mask))
+    return cut_object(
+        rgb,
+        depth,
+        np.ascontiguousarray(mask),
+        intrinsics.matrix,
+        scale,
+        resolution=resolution,
+        crop=crop,
+        background=background,
+        pad=pad,
+        erosion=erosion,
+        edge_tolerance=edge_tolerance,
+        drop_outliers=drop_outliers,
+    )
 
+
+def cut_object(
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    mask: np.ndarray,
+    matrix: np.ndarray,
+    scale: float = 1.0,
+    *,
+    resolution: int = 224,
+    crop: Crop = "square",
+    background: Background = "black",
+    pad: float = 0.2,
+    erosion: int = 2,
+    edge_tolerance: float = 0.02,
+    drop_outliers: bool = True,
+) -> tuple[View, Similarity]:
+    """`frame_turned` for images that were checked and undistorted before: many masks of one frame are cut out of it.
+
+    Args:
+        rgb: uint8 or float32 in [0, 1], height × width × 3.
+        depth: in units of ``scale`` metres; 0 = unknown.
+        mask: bool, not empty.
+        matrix: K, pixels.
+
+    Raises:
+        ValueError: there is no depth to be trusted inside the mask, or no object can be that near or far.
+    """
+    mask, bounds = drop_specks(mask)
     median = check_depth_unit(depth, mask, bounds, scale)
     cut = cut_square if crop == "square" else cut_look_at
-    rgb, depth, mask, matrix, rotation = cut(
-        rgb, depth, mask, bounds, intrinsics.matrix, scale, resolution, pad, erosion, edge_tolerance
+    rgb, depth, mask, crop_matrix, rotation = cut(
+        rgb, depth, mask, bounds, matrix, scale, resolution, pad, erosion, edge_tolerance
     )
     if drop_outliers:
         # Twice the diagonal of what is seen, and six deviations for things seen end-on.
@@ -184,7 +225,7 @@ def frame_turned(
             values = depth[seen]
             centre = np.median(values)
             left, top, right, bottom = bounds
-            diagonal = float(np.hypot(right - left, bottom - top)) * median / float(intrinsics.matrix[0, 0])
+            diagonal = float(np.hypot(right - left, bottom - top)) * median / float(matrix[0, 0])
             reach = max(2 * diagonal, 6 * 1.4826 * float(np.median(np.abs(values - centre))))
             depth[seen & (np.abs(depth - centre) > reach)] = 0
     if not (mask & (depth > 0)).any():
@@ -195,7 +236,7 @@ def frame_turned(
         rgb=jnp.asarray(rgb),
         depth=jnp.asarray(depth),
         mask=jnp.asarray(mask),
-        camera=Camera.from_matrix(matrix),
+        camera=Camera.from_matrix(crop_matrix),
     )
     return view, Similarity(rotation, np.zeros(3), np.ones(())).to_jax()
 

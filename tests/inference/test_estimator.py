@@ -68,7 +68,7 @@ def test_the_estimator_compares_compacted_templates(monkeypatch):
         seconds[name] = 0.0
         return lambda *_: make_estimate(still)
 
-    monkeypatch.setattr(Estimator, "_compile", ready)
+    monkeypatch.setattr(Estimator, "compiled", ready)
     estimator = Estimator([(whole, info)], None)
     for _ in range(2):
         result = estimator.run(0, query.view, still, patches=query.patches)

@@ -1,0 +1,93 @@
+"""Which of all that was tried are detections: one thing is one object, and one instance of it is found once."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ipjax.metrics.surface import add_s
+from ipjax.records import Similarity, Templates
+
+SAMPLE = 256  # surface points that two poses are compared by
+_distance = jax.jit(add_s)
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """An object at a pose, and the pixels that it would take."""
+
+    index: int  # of the object
+    name: str
+    mask: Bool[np.ndarray, "h w"]
+    pose: Similarity  # camera_from_object
+    confidence: float
+    value: float  # what claims of one object are sorted by
+    source: Any = None  # what the caller knows it by
+
+
+def shared_share(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
+    """The share of the smaller mask that the other one covers, too."""
+    smaller = min(int(first.sum()), int(second.sum()))
+    return int((first & second).sum()) / smaller if smaller else 0.0
+
+
+def overlap(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union."""
+    either = int((first | second).sum())
+    return int((first & second).sum()) / either if either else 0.0
+
+
+def same_instance(templates: Templates, first: Similarity, second: Similarity, apart: float) -> bool:
+    """Whether two poses of an object fill the same space, turns after which it looks the same included.
+
+    By ADD-S, the mean distance of one's surface to the nearest point of the other's, less than ``apart`` diameters of
+    the smaller. Two solid things cannot be in one place, so also a pose that is turned wrongly is of that instance.
+    """
+    points = sample_surface(templates)
+    distance = float(_distance(points, first, second))
+    return distance < apart * min(float(first.scale), float(second.scale))
+
+
+def sample_surface(templates: Templates) -> Float[jax.Array, "n 3"]:
+    """As many points of every object's surface, so that they are compared by one program."""
+    points = np.asarray(templates.surface.points, np.float32)
+    return jnp.asarray(points[np.linspace(0, len(points) - 1, SAMPLE).astype(int)])
+
+
+def assign(
+    claims: Sequence[Claim], templates: Sequence[Templates], *, instances: int, taken: float, apart: float
+) -> tuple[list[Claim], list[tuple[Claim, str]]]:
+    """Those claims that hold, the surest first, and the others with the reason.
+
+    The claim of highest confidence holds first; then the next one whose place is not taken: by itself (the same pose
+    within ``apart`` diameters, or more than ``taken`` of the smaller mask), or by another object. By confidence, not by
+    similarity of the crop: assigning objects by that lowered the precision.
+
+    Args:
+      instances: of an object, at most.
+    """
+    kept: list[Claim] = []
+    dropped: list[tuple[Claim, str]] = []
+    for claim in sorted(claims, key=lambda one: (-one.confidence, -one.value)):
+        mine = [one for one in kept if one.index == claim.index]
+        again = next((one for one in mine if _is_same(claim, one, templates, taken, apart)), None)
+        other = next((one for one in kept if shared_share(one.mask, claim.mask) > taken), None)
+        if again is not None:
+            dropped.append((claim, "the same instance was found with more confidence"))
+        elif other is not None:
+            dropped.append((claim, f"its pixels are taken by {other.name}, which is surer"))
+        elif len(mine) >= instances:
+            dropped.append((claim, f"{instances} surer instance{'s were' if instances > 1 else ' was'} found"))
+        else:
+            kept.append(claim)
+    return kept, dropped
+
+
+def _is_same(claim: Claim, other: Claim, templates: Sequence[Templates], taken: float, apart: float) -> bool:
+    if shared_share(claim.mask, other.mask) > taken:
+        return True
+    return same_instance(templates[claim.index], claim.pose, other.pose, apart)

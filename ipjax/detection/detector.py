@@ -1,0 +1,368 @@
+"""Objects in frames without masks: proposals, described once, ranked for each object, verified by their poses."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ipjax.config import Config, DetectConfig
+from ipjax.detection.assignment import Claim, assign, overlap, same_instance
+from ipjax.detection.crops import Crop, Scene, cut_crop, read_scene
+from ipjax.detection.masks import mask_from_pose
+from ipjax.detection.proposals.propose import ProposalConfig, Proposals, propose
+from ipjax.detection.records import Detection, Detections, Rejected
+from ipjax.detection.signatures import Signature, glance, similarity, template_signatures
+from ipjax.detection.stopwatch import Stopwatch
+from ipjax.estimation.features import describe
+from ipjax.files.objects.record import ObjectInfo
+from ipjax.inference.batching import thin_templates
+from ipjax.inference.estimator import Estimator, Result
+from ipjax.progress import bar
+from ipjax.records import PoseEstimate, Templates
+
+
+@dataclasses.dataclass(frozen=True)
+class _Trial:
+    """A proposal (or what a pose made of it) that was estimated as an object."""
+
+    index: int
+    proposal: int
+    similarity: float
+    crop: Crop
+    result: Result
+    value: float  # confidence × score, and how well a known size agrees
+    proposed: np.ndarray  # the proposal's mask
+
+
+@dataclasses.dataclass
+class Sight:
+    """A frame as no object has changed it yet: its proposals, cut out and described (`Detector.look`)."""
+
+    scene: Scene
+    proposals: Proposals
+    crops: list[Crop | None]  # None where nothing of a proposal can be used
+    signatures: Signature | None  # of the crops that can be used, and as many more as fill a bucket
+    used: np.ndarray  # the numbers of those crops
+    similarity: np.ndarray  # objects × proposals, filled in by `Detector.seek`
+    watch: Stopwatch
+
+
+class Detector:
+    """Objects and an encoder, ready to be found in frames without masks.
+
+    All objects are padded to one size, so that what was compiled for one serves all, and the crops of a frame are cut
+    out and described once for all objects.
+
+    Args:
+        objects: templates and what is known of them, as `ipjax.load` returns them. Of each, ``detection.views``
+            templates are used, and kept in memory.
+        encoder: made the templates' features.
+        config: of the estimates that verify proposals.
+        detection: how objects are sought.
+        proposals: how a frame is cut up; None = as by default.
+        quick: as `ipjax.Estimator` has it.
+        options: of `ipjax.inference.frames.cut_object`; "square" crops by default.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[tuple[Templates, ObjectInfo]],
+        encoder: Any,
+        config: Config | None = None,
+        *,
+        detection: DetectConfig = DetectConfig(),
+        proposals: ProposalConfig | None = None,
+        quick: bool = False,
+        **options: Any,
+    ):
+        objects = list(objects)
+        if not objects:
+            raise ValueError("a detector needs at least one object")
+        sizes = sorted({info.resolution for _, info in objects})
+        if len(sizes) > 1:
+            raise ValueError(f"the objects' templates have {' and '.join(map(str, sizes))} pixels: detect them apart")
+        self.detection = detection
+        self.proposals = proposals
+        config = Config.fast() if config is None else config
+        thinned = [_thinned(*one, detection.views) for one in objects]
+        self.estimator = Estimator(thinned, encoder, config, quick=quick, alike=True, **options)
+        self.options = {"resolution": sizes[0]} | self.estimator.options
+        self.zoom = _usable_zoom(objects[0][0], sizes[0], detection.zoom)
+        self._signatures: dict[int, Signature] = {}
+
+    @property
+    def names(self) -> list[str]:
+        """Of the objects, in their order."""
+        return [info.name for _, info in self.estimator.objects]
+
+    def detect(
+        self,
+        rgb: Any,
+        depth: Any,
+        camera: Any,
+        *,
+        instances: int | None = 1,
+        diameters: Sequence[float | None] | None = None,
+        depth_scale: float | None = None,
+        seed: int = 0,
+        progress: bool = False,
+    ) -> Detections:
+        """Find the objects in a frame.
+
+        Args:
+            rgb: height × width × 3; uint8, uint16 or float in [0, 1].
+            depth: height × width along z, aligned to the colour image; float metres, or any unit with ``depth_scale``.
+            camera: `Intrinsics`, `Camera`, 3 × 3 K, or (fx, fy, cx, cy), in pixels. Masks are of the image without lens
+                distortion.
+            instances: of each object, at most; None = as many as are there (up to ``detection.instances``).
+            diameters: each object's true diameter in metres, None where it is not known.
+            seed: same seed, same answer.
+            progress: show a bar.
+
+        Returns:
+            What was found, the surest first. A detection that is not ``present`` is the best guess; whether to believe
+            it is the caller's.
+
+        Raises:
+            ValueError: the images do not fit together, or there is no depth; in words.
+        """
+        sight = self.look(rgb, depth, camera, depth_scale)
+        most = self.detection.instances if instances is None else instances
+        if most < 1:
+            raise ValueError(f"at least one instance must be sought, not {instances}")
+        count = len(self.estimator.objects)
+        diameters = [None] * count if diameters is None else list(diameters)
+        if len(diameters) != count:
+            raise ValueError(f"{count} objects and {len(diameters)} diameters")
+        claims: list[Claim] = []
+        rejected: list[Rejected] = []
+        for index in bar(range(count), desc="detecting", unit=" objects", disable=not progress or count < 2):
+            found, others = self.seek(sight, index, instances=most, diameter=diameters[index], seed=seed)
+            claims += found
+            rejected += others
+        return self.choose(sight, claims, rejected, instances=most)
+
+    def look(self, rgb: Any, depth: Any, camera: Any, depth_scale: float | None = None) -> Sight:
+        """The first part of `detect`, which no object has a part in: proposals, cut out and described.
+
+        Raises ValueError as `detect`.
+        """
+        scene = read_scene(rgb, depth, camera, depth_scale)
+        watch = Stopwatch()
+        with watch("propose"):
+            proposals = propose(scene.rgb, scene.depth, scene.matrix, self.proposals)
+        with watch("cut"):
+            crops = [cut_crop(scene, mask, **self.options) for mask in proposals.masks]
+        signatures, used = None, np.zeros(0, int)
+        with watch("glance"):
+            used = np.flatnonzero([crop is not None for crop in crops])
+            if used.size:
+                signatures = self._glance_all([crop for crop in crops if crop is not None], watch)
+        ranks = np.full((len(self.estimator.objects), len(crops)), -np.inf)
+        return Sight(scene, proposals, crops, signatures, used, ranks, watch)
+
+    def seek(
+        self, sight: Sight, index: int, *, instances: int = 1, diameter: float | None = None, seed: int = 0
+    ) -> tuple[list[Claim], list[Rejected]]:
+        """The second part of `detect`: one object in the proposals that are most like it.
+
+        Args:
+            sight: from `look`.
+            index: of the object.
+            instances, diameter, seed: as `detect` has them.
+
+        Returns:
+            Poses with the pixels that they claim, and what was given up.
+        """
+        rejected: list[Rejected] = []
+        with sight.watch("rank"):
+            self._rank(sight, index)
+        first = self._verify(sight, index, instances, diameter, seed)
+        mended = self._mend(sight, first, instances, diameter, seed, rejected)
+        return self._claims(sight, mended, rejected), rejected
+
+    def choose(
+        self, sight: Sight, claims: Sequence[Claim], rejected: Sequence[Rejected] = (), *, instances: int = 1
+    ) -> Detections:
+        """The last part of `detect`: which claims of all objects hold. ``instances`` of each at most."""
+        with sight.watch("assign"):
+            kept, dropped = assign(
+                claims,
+                [templates for templates, _ in self.estimator.objects],
+                instances=instances,
+                taken=self.detection.taken,
+                apart=self.detection.same,
+            )
+        lost = [_reject(claim.source, reason, claim.mask) for claim, reason in dropped]
+        seconds = dict(sight.watch.spent)
+        found = tuple(_detection(claim) for claim in kept)
+        return Detections(found, (*rejected, *lost), sight.proposals, sight.similarity, seconds)
+
+    def _glance_all(self, crops: Sequence[Crop], watch: Stopwatch) -> Signature:
+        encoder = self.estimator.encoder
+        look = lambda encoder, view: glance(encoder, view, self.zoom)
+        found = []
+        for crop in crops:
+            compiled = self.estimator.compiled("glance", look, watch.spent, encoder, crop.view)
+            found.append(compiled(encoder, crop.view))
+        # Padded to a multiple, so that frames of other numbers of proposals take the same program.
+        found += [found[0]] * (-len(found) % _BUCKET)
+        return jax.block_until_ready(jax.tree.map(lambda *x: jnp.stack(x), *found))
+
+    def _rank(self, sight: Sight, index: int) -> None:
+        """Similarity of an object to every crop."""
+        if sight.signatures is None:
+            return
+        if index not in self._signatures:
+            self._signatures[index] = jax.block_until_ready(_template_signatures(self.estimator.objects[index][0]))
+        settings = self.detection
+        found = _similarity(self._signatures[index], sight.signatures, settings.alike, settings.colour)
+        sight.similarity[index, sight.used] = np.asarray(found)[: len(sight.used)]
+
+    def _verify(self, sight: Sight, index: int, instances: int, diameter: float | None, seed: int) -> list[_Trial]:
+        """An object estimated in the proposals that are most like it, the best first."""
+        ranks = sight.similarity[index]
+        order = [int(i) for i in np.argsort(-ranks, kind="stable") if np.isfinite(ranks[i])]
+        trials = []
+        for proposal in order[: self.detection.verified + 2 * (instances - 1)]:
+            crop = sight.crops[proposal]
+            assert crop is not None
+            known = float(ranks[proposal])
+            trials.append(self._try(index, proposal, known, crop, diameter, seed, sight, "verify"))
+        return sorted(trials, key=lambda one: -one.value)
+
+    def _try(
+        self,
+        index: int,
+        proposal: int,
+        alike: float,
+        crop: Crop,
+        diameter: float | None,
+        seed: int,
+        sight: Sight,
+        stage: str,
+    ) -> _Trial:
+        estimator, watch = self.estimator, sight.watch
+        with watch("describe"):
+            if crop.patches is None:
+                run = estimator.compiled("describe", describe, watch.spent, estimator.encoder, crop.view)
+                crop.patches = jax.block_until_ready(run(estimator.encoder, crop.view))
+        with watch(stage):
+            result = estimator.run(index, crop.view, crop.camera_from_crop, seed=seed, patches=crop.patches)
+        watch.move("compile", result.seconds.get("compile", 0.0), stage)
+        value = self._value(result.estimate, diameter)
+        return _Trial(index, proposal, alike, crop, result, value, sight.proposals.masks[proposal])
+
+    def _value(self, found: PoseEstimate, diameter: float | None) -> float:
+        """What trials of one object are compared by: confidence × score, and how well a known size agrees."""
+        if not bool(found.success):
+            return 0.0
+        value = float(found.confidence) * float(found.hypotheses.score[0])
+        if diameter is None:
+            return value
+        off = np.log(float(found.camera_from_object.scale) / diameter) / self.detection.size_deviation
+        return value * float(np.exp(-0.5 * off**2))
+
+    def _mend(
+        self,
+        sight: Sight,
+        trials: Sequence[_Trial],
+        instances: int,
+        diameter: float | None,
+        seed: int,
+        rejected: list[Rejected],
+    ) -> list[_Trial]:
+        """The best poses that differ, estimated again in the masks that they give."""
+        settings, scene = self.detection, sight.scene
+        mended: list[_Trial] = []
+        chosen: list[PoseEstimate] = []
+        for trial in trials:
+            templates, found = self.estimator.objects[trial.index][0], trial.result.estimate
+            pose = found.camera_from_object
+            if trial.value <= 0:
+                rejected.append(_reject(trial, "no pose was found"))
+            elif len(chosen) >= settings.mended + instances - 1:
+                rejected.append(_reject(trial, "other proposals have surer poses"))
+            elif any(same_instance(templates, one.camera_from_object, pose, settings.same) for one in chosen):
+                rejected.append(_reject(trial, "another proposal led to the same pose, and is surer"))
+            else:
+                chosen.append(found)
+                with sight.watch("mask"):
+                    mask = mask_from_pose(templates, pose, scene.matrix, scene.depth, settings)[0]
+                    crop = cut_crop(scene, mask, **self.options)
+                if crop is None:
+                    rejected.append(_reject(trial, _ELSEWHERE))
+                    continue
+                about = trial.index, trial.proposal, trial.similarity
+                mended.append(self._try(*about, crop, diameter, seed, sight, "verify again"))
+        return mended
+
+    def _claims(self, sight: Sight, trials: Sequence[_Trial], rejected: list[Rejected]) -> list[Claim]:
+        """The pixels of each pose; a pose whose depth is another's claims nothing."""
+        claims = []
+        for trial in trials:
+            templates, info = self.estimator.objects[trial.index]
+            found = trial.result.estimate
+            if trial.value <= 0:
+                rejected.append(_reject(trial, "no pose was found in the mask of its first pose"))
+                continue
+            pose = found.camera_from_object
+            with sight.watch("mask"):
+                mask = mask_from_pose(templates, pose, sight.scene.matrix, sight.scene.depth, self.detection)[0]
+            if not mask.any():
+                rejected.append(_reject(trial, _ELSEWHERE))
+                continue
+            claims.append(Claim(trial.index, info.name, mask, pose, float(found.confidence), trial.value, trial))
+        return claims
+
+
+_ELSEWHERE = "the depth where its pose is belongs to something else"
+
+
+def _detection(claim: Claim) -> Detection:
+    trial: _Trial = claim.source
+    rows, columns = np.flatnonzero(claim.mask.any(1)), np.flatnonzero(claim.mask.any(0))
+    left, top = int(columns[0]), int(rows[0])
+    box = left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
+    near = overlap(trial.proposed, claim.mask)
+    about = trial.result, trial.proposal, trial.similarity, near
+    return Detection(claim.index, claim.name, claim.mask, box, claim.value, *about)
+
+
+def _reject(trial: _Trial, reason: str, mask: np.ndarray | None = None) -> Rejected:
+    return Rejected(
+        trial.index,
+        trial.result.info.name,
+        trial.proposal,
+        trial.similarity,
+        reason,
+        float(trial.result.estimate.confidence),
+        trial.value,
+        trial.crop.mask if mask is None else mask,
+    )
+
+
+_BUCKET = 64
+_template_signatures = jax.jit(template_signatures)
+_similarity = jax.jit(similarity, static_argnums=2)
+
+
+def _usable_zoom(templates: Templates, resolution: int, zoom: int) -> int:
+    """The largest zoom up to the one asked for at which a crop is still a whole number of patches."""
+    cells = int(np.asarray(templates.patches.grid).max()) + 1
+    patch = resolution // cells
+    return next(z for z in range(zoom, 0, -1) if resolution % (z * patch) == 0)
+
+
+def _thinned(templates: Templates, info: ObjectInfo, count: int) -> tuple[Templates, ObjectInfo]:
+    """With fewer templates, and the pictures of those."""
+    if templates.reference is not None:  # the views of a photo are few, and around it
+        return templates, info
+    templates, kept = thin_templates(templates, count)
+    pictures = info.pictures
+    if pictures is not None:
+        pictures = pictures[kept] if isinstance(pictures, np.ndarray) else [pictures[i] for i in kept]
+    return templates, dataclasses.replace(info, pictures=pictures)
