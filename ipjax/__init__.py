@@ -17,12 +17,15 @@ if TYPE_CHECKING:
         ConfidenceConfig,
         Config,
         DescribeConfig,
+        DetectConfig,
         MatchConfig,
         OnboardConfig,
         RefineConfig,
         ResectConfig,
         ScoreConfig,
     )
+    from ipjax.detection.detector import Detector
+    from ipjax.detection.records import Detection, Detections
     from ipjax.estimation.features import describe, observe
     from ipjax.estimation.pipeline import estimate
     from ipjax.files.cameras.intrinsics import Intrinsics
@@ -58,6 +61,10 @@ __all__ = [
     "Config",
     "Dataset",
     "DescribeConfig",
+    "DetectConfig",
+    "Detection",
+    "Detections",
+    "Detector",
     "Estimator",
     "Intrinsics",
     "MatchConfig",
@@ -118,11 +125,17 @@ _HOMES = {
         "ConfidenceConfig",
         "Config",
         "DescribeConfig",
+        "DetectConfig",
         "MatchConfig",
         "OnboardConfig",
         "RefineConfig",
         "ResectConfig",
         "ScoreConfig",
+    ),
+    "detection.detector": ("Detector",),
+    "detection.records": (
+        "Detection",
+        "Detections",
     ),
     "estimation.features": (
         "describe",

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from builders import tiny_pipeline
+from builders.detections import MATRIX, ellipsoid, make_frame, place, stranger
 from PIL import Image
 
 import ipjax
@@ -40,7 +41,7 @@ def test_quickstart_runs(tmp_path, monkeypatch):
         resolve()
     except WeightsError as error:
         pytest.skip(f"no weights on this machine: {error}")
-    code, _ = find_blocks("python")
+    code, *_ = find_blocks("python")
     small = ipjax.OnboardConfig(surface=1024)
     quick = ipjax.Config(
         score=ipjax.ScoreConfig(resolution=28),
@@ -74,7 +75,7 @@ def test_quickstart_runs(tmp_path, monkeypatch):
 
 def test_many_at_once_runs(monkeypatch):
     """Word for word: two objects of different sizes, a query of each, and their diameters. With the tests' encoder."""
-    _, code = find_blocks("python")
+    _, code, _ = find_blocks("python")
     monkeypatch.setattr(ipjax, "Config", lambda: tiny_pipeline.DRAWN)
     names = {"ipjax": ipjax, "encoder": problems.make_encoder()}
     names["mug"], names["tin"] = tiny_pipeline.two_objects()
@@ -88,8 +89,21 @@ def test_many_at_once_runs(monkeypatch):
         tiny_pipeline.assert_near(pose, truth, 0.05, 1e-6, 15)
 
 
+def test_without_a_mask_runs(monkeypatch, capsys):
+    """Word for word: two objects, of which one is there, with the tests' encoder and the smallest settings."""
+    *_, code = find_blocks("python")
+    objects = {"mug.ipjax": ellipsoid(), "tin.ipjax": stranger()}
+    monkeypatch.setattr(ipjax, "load", lambda path: objects[path])
+    monkeypatch.setattr(ipjax, "load_encoder", problems.make_encoder)
+    monkeypatch.setattr(ipjax, "Detector", functools.partial(ipjax.Detector, config=tiny_pipeline.DRAWN))
+    frame = make_frame(place(-0.1, 0.05))
+    exec(compile(code, str(README), "exec"), {"rgb": frame.rgb, "depth": frame.depth, "camera": MATRIX})
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("ellipsoid ")
+
+
 def test_quickstart_is_ten_lines():
-    code, _ = find_blocks("python")
+    code, *_ = find_blocks("python")
     assert len([line for line in code.splitlines() if line.strip()]) <= 10
 
 

@@ -12,6 +12,7 @@ from ipjax.bop.objects import OnboardedObject
 from ipjax.bop.records import MM, Estimate, Frame, Target
 from ipjax.config import Config
 from ipjax.files.objects.loading import load
+from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.provenance import hash_executed
 from ipjax.files.settings import describe_config
 from ipjax.inference.estimator import Estimator, Result
@@ -99,7 +100,7 @@ class DatasetEstimator:
         """What the results depend on, as plain JSON; a resumed run must agree in it."""
         made = {}
         for obj_id in self.objects:
-            info = self.estimator.objects[self._index(obj_id)][1]
+            info = self.info(obj_id)
             made[str(obj_id)] = {
                 "content": info.content_sha256,
                 "mesh": info.mesh_sha256,
@@ -141,9 +142,7 @@ class DatasetEstimator:
                 continue
             seconds = time.perf_counter() - start
             info = self.estimator.objects[index][1]
-            model_from_mesh = self.objects[target.obj_id].model_from_mesh
-            unit = info.metres_per_unit or MM if model_from_mesh is None else float(model_from_mesh.scale)
-            diameter = unit / info.mesh_scale if self.known_size else None
+            diameter = self.unit(target.obj_id, info) / info.mesh_scale if self.known_size else None
             result = self.estimator.run(index, *crop, seed=self.seed, diameter=diameter, patches=patches)
             self.compile_seconds += result.seconds.get("compile", 0.0)
             if self.described is not None and patches is None and len(self.described) < SHARED:
@@ -154,12 +153,28 @@ class DatasetEstimator:
             if not bool(result.estimate.success):
                 self.refused.append(f"{where}: no pose found")
                 continue
-            pose = result.estimate.camera_from_object.to_numpy() @ info.object_from_mesh.to_numpy()
-            # Metres per metre of the model, or per unit of a mesh of its own.
-            scale = float(pose.scale) / (unit if model_from_mesh is None else 1)
             score = target.score * float(result.estimate.confidence)
-            found.append(Estimate(target.obj_id, score, pose.rotation, pose.translation, scale))
+            found.append(self.as_estimate(target.obj_id, result, score))
         return found
+
+    def as_estimate(self, obj_id: int, result: Result, score: float) -> Estimate:
+        """A result for the coordinates of the object's model, or of a mesh of its own."""
+        pose = result.estimate.camera_from_object.to_numpy() @ result.info.object_from_mesh.to_numpy()
+        # Metres per metre of the model, or per unit of a mesh of its own.
+        scale = float(pose.scale) / (self.unit(obj_id, result.info) if self._has_model(obj_id) else 1)
+        return Estimate(obj_id, score, pose.rotation, pose.translation, scale)
+
+    def unit(self, obj_id: int, info: ObjectInfo) -> float:
+        """Metres in a unit of the mesh that an object was onboarded from."""
+        model_from_mesh = self.objects[obj_id].model_from_mesh
+        return info.metres_per_unit or MM if model_from_mesh is None else float(model_from_mesh.scale)
+
+    def _has_model(self, obj_id: int) -> bool:
+        return self.objects[obj_id].model_from_mesh is None
+
+    def info(self, obj_id: int) -> ObjectInfo:
+        """What is known of an object."""
+        return self.estimator.objects[self._index(obj_id)][1]
 
     def _index(self, obj_id: int) -> int:
         if obj_id not in self.order:

@@ -7,12 +7,23 @@ from typing import Any
 
 from ipjax.commands.interface import options
 from ipjax.commands.interface.candidates import MOST, check_any, estimate_best
+from ipjax.commands.interface.detection import (
+    Found,
+    detect_frame,
+    is_without_masks,
+    make_detector,
+    mend_mask,
+    parse_instances,
+)
 from ipjax.commands.interface.frames import FrameFiles, Images, choose_masks, list_frames, read_frame
 from ipjax.commands.interface.messages import Messages, in_one_line
+from ipjax.commands.interface.outputs import compare_photos, draw_frame, mesh_paths, write_mesh
 from ipjax.commands.interface.parser import add_command, parse_count
 
 EXAMPLES = """\
 examples:
+  ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json -o pose.json --overlay out.png
+  ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json --instances all
   ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png -o pose.json
   ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json \\
       --mask mug.png --mask box.png --overlay out.png       several objects: one mask (or box) each, in their order
@@ -20,6 +31,10 @@ examples:
   ipjax estimate mug.ipjax --rgb a.png --depth a.png --camera camera.json --mask detections.json --obj-id 5
   ipjax estimate mug.ipjax --frames scene/ -o poses.json --overlay pictures/
   ipjax estimate mug.ipjax --frames scene/ --config fast --set match.views=4 --json | jq .frames[].objects
+
+Without a mask or a box the objects are sought: the image is cut up by depth and colour into pieces that may be things,
+those most like an object are estimated, and the mask is taken from the surest pose. --instances says how many of each.
+A mask, a box, and a known size (--diameter) make it surer; --mask-is-rough mends a mask that is too wide, or cut off.
 
 A mask is an image of any kind, or a file of detections: JSON of BOP, COCO, SAM or Grounded-SAM, npz of CNOS or SAM-6D,
 a stack of masks as npy, an image of labels. Of several masks without a class each is tried, and the one of highest
@@ -86,6 +101,18 @@ def add(commands: Any) -> None:
         default=MOST,
         help=f"of several masks that may be the object's, try the N best, one estimate each (default {MOST})",
     )
+    parser.add_argument(
+        "--instances",
+        type=parse_instances,
+        metavar="N|all",
+        default=1,
+        help="without masks: how many of each object are sought (default 1)",
+    )
+    parser.add_argument(
+        "--mask-is-rough",
+        action="store_true",
+        help="estimate again in the mask of the pose, and say how much the given one was off",
+    )
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--size", type=float, metavar="MM", help="the object's true diameter in millimetres, if known")
     size.add_argument("--diameter", type=float, metavar="METRES", help="the same in metres")
@@ -141,10 +168,13 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     estimator = Estimator(
         objects, encoder, config, quick=not many, crop=arguments.crop, depth_scale=arguments.depth_scale
     )
+    detector = None
+    if any(is_without_masks(files) for files in frames if not files.error):
+        detector = make_detector(objects, encoder, quick=not many, crop=arguments.crop)
     entries: list[dict[str, Any]] = []
     for files in frames:
         try:
-            entries.append(_estimate_frame(files, first, estimator, arguments, messages))
+            entries.append(_estimate_frame(files, first, estimator, detector, arguments, messages))
         except (ValueError, OSError) as error:
             if not many:
                 raise
@@ -181,7 +211,11 @@ def _check(arguments: argparse.Namespace) -> None:
             raise ValueError(f"--{name.replace('_', '-')} is given once for each object, in their order")
     if arguments.output is not None:
         options.check_output(arguments.output, (".json",))
-    several = arguments.frames is not None or len(arguments.objects) > 1
+    several = arguments.frames is not None or len(arguments.objects) > 1 or arguments.instances != 1
+    if arguments.instances != 1 and (arguments.mask or arguments.box):
+        raise ValueError("--instances is for objects that are sought; a mask or a box shows one")
+    if arguments.mask_is_rough and not (arguments.mask or arguments.frames):
+        raise ValueError("--mask-is-rough needs a --mask")
     for name, path, suffixes, is_folder in (
         ("overlay", arguments.overlay, options.PICTURES, arguments.frames is not None),
         ("comparison", arguments.compare, options.PICTURES, arguments.frames is not None),
@@ -190,7 +224,7 @@ def _check(arguments: argparse.Namespace) -> None:
         if path is not None and not is_folder:
             options.check_output(path, suffixes)
         elif path is not None and path.exists() and not path.is_dir():
-            of = "--frames" if arguments.frames is not None else "several objects"
+            of = "--frames" if arguments.frames is not None else "several objects or instances"
             raise ValueError(f"{path}: with {of}, the {name} is a folder")
     if arguments.size is not None:
         if not 1 <= arguments.size < 1e5:
@@ -215,6 +249,11 @@ def _read_first(files: FrameFiles, arguments: argparse.Namespace, names: list[st
     from ipjax.inference.frames import frame
 
     images = read_frame(files, arguments, names)
+    if is_without_masks(files):
+        from ipjax.detection.crops import read_scene
+
+        read_scene(images.rgb, images.depth, images.camera, arguments.depth_scale)
+        return images
     for candidates, box in zip(images.candidates, files.boxes, strict=True):
         given: dict[str, Any] = {"depth_scale": arguments.depth_scale, "crop": arguments.crop}
         if candidates is None:
@@ -225,17 +264,81 @@ def _read_first(files: FrameFiles, arguments: argparse.Namespace, names: list[st
 
 
 def _estimate_frame(
-    files: FrameFiles, images: Images | None, estimator: Any, arguments: argparse.Namespace, messages: Messages
+    files: FrameFiles,
+    images: Images | None,
+    estimator: Any,
+    detector: Any,
+    arguments: argparse.Namespace,
+    messages: Messages,
 ) -> dict[str, Any]:
     """Estimate the objects of one frame and draw its overlay; returns its entry in the result.
 
-    ``images``: the frame, where it has been read already.
+    ``images``: the frame, where it has been read already. ``detector``: for frames without masks.
     """
-    from ipjax.inference.reports import estimate_as_json
-
     warned = len(messages.warnings)
+    infos = [info for _, info in estimator.objects]
     if images is None:
-        images = read_frame(files, arguments, [info.name for _, info in estimator.objects])
+        images = read_frame(files, arguments, [info.name for info in infos])
+    # A reference photo with depth has measured the size; else it is free, unless the user knows it.
+    given = arguments.diameter is not None or arguments.free_size
+    diameters = [arguments.diameter if given else info.measured_diameter for info in infos]
+    detection = None
+    if is_without_masks(files):
+        found, detection = detect_frame(files.name, images, detector, estimator, diameters, arguments, messages)
+        entries = [_entry(one, arguments) | {"mask": None, "detected": one.about} for one in found]
+    else:
+        found, entries = _estimate_masks(files, images, estimator, diameters, arguments, messages)
+    results = [one.result for one in found if one.result is not None]
+    for result in results:
+        for line in result.warnings:
+            messages.keep(line, is_warning=True)
+    entry: dict[str, Any] = {
+        "frame": files.name,
+        "rgb": str(files.rgb),
+        "read_seconds": images.seconds,
+        "warnings": list(dict.fromkeys(messages.warnings[warned:])),
+        "objects": entries,
+    }
+    if detection is not None:
+        entry["detection"] = detection
+    if arguments.overlay is not None:
+        start = time.perf_counter()
+        masks = [one.mask for one in found if one.result is not None]
+        entry["overlay"] = str(draw_frame(files.name, images, results, masks, estimator.config, arguments))
+        entry["draw_seconds"] = round(time.perf_counter() - start, 6)
+    if arguments.compare is not None and results:
+        entry["comparison"] = str(compare_photos(files.name, results, arguments))
+    if arguments.mesh_out is not None:
+        paths = mesh_paths(files.name, len(entries), arguments)
+        for one, known, path in zip(entries, found, paths, strict=True):
+            one["mesh_written"] = None if known.result is None else write_mesh(known.result, path, messages)
+    return entry
+
+
+def _entry(found: Found, arguments: argparse.Namespace) -> dict[str, Any]:
+    """What is told of one object in one frame."""
+    from ipjax.inference.reports import estimate_as_json, nothing_as_json
+
+    path, result = arguments.objects[found.index], found.result
+    if result is None:
+        return {"object_file": str(path), **nothing_as_json(path.stem)}
+    return {
+        "object_file": str(path),
+        **estimate_as_json(result.estimate, result.templates, result.info),
+        "size_given_mm": None if found.diameter is None else 1e3 * found.diameter,
+        "stage_seconds": {name: round(value, 6) for name, value in ({"frame": found.seconds} | result.seconds).items()},
+    }
+
+
+def _estimate_masks(
+    files: FrameFiles,
+    images: Images,
+    estimator: Any,
+    diameters: list[float | None],
+    arguments: argparse.Namespace,
+    messages: Messages,
+) -> tuple[list[Found], list[dict[str, Any]]]:
+    """Estimate each object in the mask, box or masks that were given for it; and what is told of each."""
     crops = []
     for i, (candidates, box) in enumerate(zip(images.candidates, files.boxes, strict=True)):
         # Several masks are cut out one after the other, as each is estimated.
@@ -246,60 +349,34 @@ def _estimate_frame(
         start = time.perf_counter()
         crop = estimator.frame(i, images.rgb, images.depth, mask, images.camera, box)
         crops.append((crop, time.perf_counter() - start))
-    entries, results = [], []
+    found, entries = [], []
     for i, cut in enumerate(crops):
         info = estimator.objects[i][1]
-        # A reference photo with depth has measured the size; else it is free, unless the user knows it.
-        given = arguments.diameter is not None or arguments.free_size
-        options: dict[str, Any] = {
-            "seed": arguments.seed,
-            "diameter": arguments.diameter if given else info.measured_diameter,
-        }
+        options: dict[str, Any] = {"seed": arguments.seed, "diameter": diameters[i]}
         start, tried = time.perf_counter(), None
+        masks = images.candidates[i]
         if cut is None:
-            masks = images.candidates[i]
             messages.print_notes()
             messages.note(f"{files.name}: {info.name}: {len(masks)} masks may be the object's: each is tried")
             result, seconds, tried = estimate_best(estimator, i, images, masks, files.boxes[i], **options)
         else:
             crop, seconds = cut
             result = estimator.run(i, *crop, **options)
-        for line in result.warnings:
-            messages.keep(line, is_warning=True)
-        results.append(result)
-        diameter = options["diameter"]
-        entries.append(
-            {
-                "object_file": str(arguments.objects[i]),
-                "mask": None if files.masks[i] is None else str(files.masks[i]),
-                **estimate_as_json(result.estimate, result.templates, result.info),
-                "size_given_mm": None if diameter is None else 1e3 * diameter,
-                "stage_seconds": {
-                    name: round(value, 6) for name, value in ({"frame": seconds} | result.seconds).items()
-                },
-            }
-        )
+        mended, mask = None, None
+        if arguments.mask_is_rough and masks is not None:
+            messages.print_notes()
+            chosen = 0 if tried is None else next(k for k, one in enumerate(tried) if one["chosen"])
+            about = files.name, images, estimator, i, result, masks[chosen].mask, messages, arguments.depth_scale
+            result, mended, mask = mend_mask(*about, **options)
+        found.append(Found(i, result, mask, seconds, diameters[i], None))
+        entries.append({"mask": None if files.masks[i] is None else str(files.masks[i])} | _entry(found[-1], arguments))
+        if mended is not None:
+            entries[-1]["mended_mask"] = mended
         if tried is not None:
             entries[-1]["candidates"] = tried
             entries[-1]["candidates_seconds"] = round(time.perf_counter() - start, 6)
             messages.note(f"{files.name}: {info.name}: {_told(tried, entries[-1]['candidates_seconds'])}")
-    entry: dict[str, Any] = {
-        "frame": files.name,
-        "rgb": str(files.rgb),
-        "read_seconds": images.seconds,
-        "warnings": list(dict.fromkeys(messages.warnings[warned:])),
-        "objects": entries,
-    }
-    if arguments.overlay is not None:
-        start = time.perf_counter()
-        entry["overlay"] = str(_draw(files.name, images, results, estimator.config, arguments))
-        entry["draw_seconds"] = round(time.perf_counter() - start, 6)
-    if arguments.compare is not None:
-        entry["comparison"] = str(_compare(files.name, results, arguments))
-    if arguments.mesh_out is not None:
-        for one, result, path in zip(entries, results, _mesh_paths(files.name, arguments), strict=True):
-            one["mesh_written"] = _write_mesh(result, path, messages)
-    return entry
+    return found, entries
 
 
 def _told(tried: list[dict[str, Any]], seconds: float) -> str:
@@ -308,69 +385,6 @@ def _told(tried: list[dict[str, Any]], seconds: float) -> str:
     best = next(one for one in tried if one["chosen"])
     left = f", {len(tried) - len(used)} could not be used" if len(used) < len(tried) else ""
     return f"mask {best['index']} has the highest confidence; {len(used)} tried in {seconds:.1f} s{left} (--instance)"
-
-
-def _draw(name: str, images: Images, results: list[Any], config: Any, arguments: argparse.Namespace) -> Path:
-    """Write the overlay of one frame; returns its path."""
-    import numpy as np
-
-    from ipjax.inference.drawing import draw, gather_evidence, write_image
-    from ipjax.inference.photos.corrected_mesh import correct_info
-
-    rgb = images.rgb
-    rgb = rgb if rgb.dtype == np.uint8 else (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
-    evidence = [gather_evidence(r.templates, r.query, r.crop_estimate, r.info, config) for r in results]
-    picture = draw(rgb, images.camera, [r.estimate for r in results], [correct_info(r) for r in results], evidence)
-    target = _picture_path(arguments.overlay, name, arguments)
-    write_image(target, picture)
-    return target
-
-
-def _picture_path(target: Path, name: str, arguments: argparse.Namespace) -> Path:
-    """The file of a frame's picture: the one named, or one in the folder, which is made."""
-    if arguments.frames is None:
-        return target
-    target.mkdir(parents=True, exist_ok=True)
-    return target / f"{name}.png"
-
-
-def _compare(name: str, results: list[Any], arguments: argparse.Namespace) -> Path:
-    """Write the photos of one frame's objects with the frame drawn into their views, a row each; returns the path."""
-    import numpy as np
-
-    from ipjax.inference.drawing import write_image
-    from ipjax.inference.photos.comparison import compare_with_photo
-
-    rows = []
-    for one in results:
-        title = f"{one.info.name}   confidence {float(one.estimate.confidence):.2f}"
-        if bool(one.estimate.success) and not bool(one.estimate.present):
-            title += "   not here, or not seen well enough: a guess"
-        rows.append(compare_with_photo(one.templates, one.query, one.crop_estimate, title))
-    target = _picture_path(arguments.compare, name, arguments)
-    write_image(target, np.concatenate(rows))
-    return target
-
-
-def _mesh_paths(name: str, arguments: argparse.Namespace) -> list[Path]:
-    """The mesh file of each object in a frame; named as masks are, where there are several."""
-    target = arguments.mesh_out
-    if arguments.frames is None and len(arguments.objects) == 1:
-        return [target]
-    return [target / f"{name}_{index:06d}.ply" for index in range(len(arguments.objects))]
-
-
-def _write_mesh(result: Any, path: Path, messages: Messages) -> str | None:
-    """Write the mesh of one object at its pose; returns its path, None where no pose was found."""
-    from ipjax.files.meshes.saving import save_mesh
-    from ipjax.inference.photos.corrected_mesh import pose_mesh
-
-    if not bool(result.estimate.success):
-        messages.note(f"{path}: not written, no pose of {result.info.name} was found")
-        return None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_mesh(pose_mesh(result), path)
-    return str(path)
 
 
 def _summary(frame: str, one: dict[str, Any]) -> str:

@@ -15,6 +15,7 @@ examples:
   ipjax evaluate ycbv/ -o results/paper --config paper --against results/default/ipjax-default_ycbv-test.csv
   ipjax evaluate ycbv/ -o results/four_views --set match.views=4
   ipjax evaluate ycbv/ -o results/cnos --detections cnos_ycbv-test.json      on other people's masks
+  ipjax evaluate ycbv/ -o results/sought --detect               without masks: objects are sought in the whole frame
   ipjax evaluate ycbv/ -o results/level2 --mesh-quality 2        on meshes made worse; see 'ipjax degrade'
   ipjax evaluate dexycb/ -o results/mustard --models ycbv/ --only 5 \\
       --mesh 5=instantmesh_mustard.obj --alignment 5=instantmesh_mustard_to_obj_000005.json
@@ -58,6 +59,14 @@ def add(commands: Any) -> None:
         metavar="FILE",
         help="masks to use: BOP's JSON, npz of CNOS or SAM-6D, or a folder of such (default: the annotated ones)",
     )
+    parser.add_argument(
+        "--detect",
+        nargs="?",
+        const="targets",
+        choices=("targets", "all"),
+        help="use no masks: seek the objects that the targets name, or all of them in every image; also writes "
+        "detections.json, masks and boxes",
+    )
     parser.add_argument("--known-size", action="store_true", help="tell the method each object's true diameter")
     options.add_crop(parser)
     options.add_scoring(
@@ -74,6 +83,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Onboard what is missing, estimate, score and show the table; returns the exit status."""
     options.check_folder(arguments.output)
     options.check_seed(arguments.seed)
+    if arguments.detect is not None and arguments.detections is not None:
+        raise ValueError("--detect seeks masks, --detections gives them: one of them")
     if arguments.against is not None and not arguments.against.is_file():
         raise ValueError(f"{arguments.against}: no such result file")
     from ipjax.bop.dataset import parse_images
@@ -107,9 +118,15 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         alignments=alignments,
         progress=not arguments.quiet,
     )
-    estimator = DatasetEstimator(
-        objects, encoder, config, crop=arguments.crop, seed=arguments.seed, known_size=arguments.known_size
-    )
+    given = {"crop": arguments.crop, "seed": arguments.seed, "known_size": arguments.known_size}
+    masks = arguments.output / "detections"
+    if arguments.detect is None:
+        estimator = DatasetEstimator(objects, encoder, config, **given)
+    else:
+        from ipjax.bop.detector import DatasetDetector
+
+        everything = arguments.detect == "all"
+        estimator = DatasetDetector(objects, encoder, config, **given, everything=everything, folder=masks)
     found = evaluate(
         dataset,
         list(objects),
@@ -127,6 +144,10 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         without=parse_images(arguments.without),
         restart="always" if arguments.restart else "never",
     )
+    if arguments.detect is not None:
+        from ipjax.bop.detector import join_detections
+
+        join_detections(masks, arguments.output / "detections.json")
     messages.say(format_score(found))
     for line in estimator.refused:
         messages.say(f"not found: {line}")
@@ -150,6 +171,8 @@ def _method(arguments: argparse.Namespace) -> str:
     parts = ["ipjax", *(re.sub(r"[^\w.]+", "-", words) for words in chosen)]
     if arguments.detections is not None:
         parts.append(re.sub(r"[^\w.]+", "-", arguments.detections.name.split(".")[0]))
+    if arguments.detect is not None:
+        parts.append("sought" if arguments.detect == "targets" else "sought-all")
     if arguments.mesh_quality:
         parts.append(f"level{arguments.mesh_quality}")
     if arguments.known_size:

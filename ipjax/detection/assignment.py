@@ -59,7 +59,12 @@ def sample_surface(templates: Templates) -> Float[jax.Array, "n 3"]:
 
 
 def assign(
-    claims: Sequence[Claim], templates: Sequence[Templates], *, instances: int, taken: float, apart: float
+    claims: Sequence[Claim],
+    templates: Sequence[Templates],
+    *,
+    instances: int | Sequence[int],
+    taken: float,
+    apart: float,
 ) -> tuple[list[Claim], list[tuple[Claim, str]]]:
     """Those claims that hold, the surest first, and the others with the reason.
 
@@ -68,7 +73,7 @@ def assign(
     similarity of the crop: assigning objects by that lowered the precision.
 
     Args:
-      instances: of an object, at most.
+      instances: of an object, at most; one number for all, or one for each.
     """
     kept: list[Claim] = []
     dropped: list[tuple[Claim, str]] = []
@@ -80,8 +85,8 @@ def assign(
             dropped.append((claim, "the same instance was found with more confidence"))
         elif other is not None:
             dropped.append((claim, f"its pixels are taken by {other.name}, which is surer"))
-        elif len(mine) >= instances:
-            dropped.append((claim, f"{instances} surer instance{'s were' if instances > 1 else ' was'} found"))
+        elif len(mine) >= (most := instances if isinstance(instances, int) else instances[claim.index]):
+            dropped.append((claim, f"{most} surer instance{'s were' if most > 1 else ' was'} found"))
         else:
             kept.append(claim)
     return kept, dropped

@@ -33,7 +33,8 @@ def bin_of(rgb: Float[Array, "*b 3"]) -> Int[Array, "*b"]:
     """The number of the bin that a colour falls into."""
     lab = to_lab(rgb)
     share = jnp.stack([lab[..., 0] / 100, *(0.5 + 0.5 * lab[..., i] / CHROMA for i in (1, 2))], axis=-1)
-    place = jnp.clip(jnp.floor(share * jnp.asarray(BINS, share.dtype)), 0, jnp.asarray(BINS) - 1).astype(jnp.int32)
+    bins = jnp.asarray(BINS, share.dtype)
+    place = jnp.clip(jnp.floor(share * bins), 0, bins - 1).astype(jnp.int32)
     return (place[..., 0] * BINS[1] + place[..., 1]) * BINS[2] + place[..., 2]
 
 

@@ -87,3 +87,13 @@ def cut_crop(scene: Scene, mask: np.ndarray, **options: Any) -> Crop | None:
     except ValueError:
         return None
     return Crop(mask, view, camera_from_crop)
+
+
+def undistort_mask(mask: np.ndarray, camera: Any) -> np.ndarray:
+    """A mask of an image as `read_scene` has it, without the lens' distortion."""
+    intrinsics = as_intrinsics(camera)
+    if not intrinsics.distortion:
+        return mask
+    depth = np.zeros(mask.shape, np.float32)
+    _, _, mask, _ = undistort_frame(np.zeros((*mask.shape, 3), np.uint8), depth, mask, None, intrinsics)
+    return mask

@@ -1,7 +1,7 @@
 """Objects in frames without masks: proposals, described once, ranked for each object, verified by their poses."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -18,8 +18,8 @@ from ipjax.detection.signatures import Signature, glance, similarity, template_s
 from ipjax.detection.stopwatch import Stopwatch
 from ipjax.estimation.features import describe
 from ipjax.files.objects.record import ObjectInfo
-from ipjax.inference.batching import thin_templates
-from ipjax.inference.estimator import Estimator, Result
+from ipjax.inference.batching import compact, thin_templates
+from ipjax.inference.estimator import MULTIPLE, Estimator, Result
 from ipjax.progress import bar
 from ipjax.records import PoseEstimate, Templates
 
@@ -58,7 +58,7 @@ class Detector:
 
     Args:
         objects: templates and what is known of them, as `ipjax.load` returns them. Of each, ``detection.views``
-            templates are used, and kept in memory.
+            templates are used, and kept in memory: with an iterator that loads them, no more than that and one object.
         encoder: made the templates' features.
         config: of the estimates that verify proposals.
         detection: how objects are sought.
@@ -69,7 +69,7 @@ class Detector:
 
     def __init__(
         self,
-        objects: Sequence[tuple[Templates, ObjectInfo]],
+        objects: Iterable[tuple[Templates, ObjectInfo]],
         encoder: Any,
         config: Config | None = None,
         *,
@@ -78,19 +78,18 @@ class Detector:
         quick: bool = False,
         **options: Any,
     ):
-        objects = list(objects)
-        if not objects:
+        thinned = [_thinned(*one, detection.views) for one in objects]
+        if not thinned:
             raise ValueError("a detector needs at least one object")
-        sizes = sorted({info.resolution for _, info in objects})
+        sizes = sorted({info.resolution for _, info in thinned})
         if len(sizes) > 1:
             raise ValueError(f"the objects' templates have {' and '.join(map(str, sizes))} pixels: detect them apart")
         self.detection = detection
         self.proposals = proposals
         config = Config.fast() if config is None else config
-        thinned = [_thinned(*one, detection.views) for one in objects]
         self.estimator = Estimator(thinned, encoder, config, quick=quick, alike=True, **options)
         self.options = {"resolution": sizes[0]} | self.estimator.options
-        self.zoom = _usable_zoom(objects[0][0], sizes[0], detection.zoom)
+        self.zoom = _usable_zoom(thinned[0][0], sizes[0], detection.zoom)
         self._signatures: dict[int, Signature] = {}
 
     @property
@@ -185,9 +184,14 @@ class Detector:
         return self._claims(sight, mended, rejected), rejected
 
     def choose(
-        self, sight: Sight, claims: Sequence[Claim], rejected: Sequence[Rejected] = (), *, instances: int = 1
+        self,
+        sight: Sight,
+        claims: Sequence[Claim],
+        rejected: Sequence[Rejected] = (),
+        *,
+        instances: int | Sequence[int] = 1,
     ) -> Detections:
-        """The last part of `detect`: which claims of all objects hold. ``instances`` of each at most."""
+        """The last part of `detect`: which claims of all objects hold. ``instances``: of each at most."""
         with sight.watch("assign"):
             kept, dropped = assign(
                 claims,
@@ -199,7 +203,7 @@ class Detector:
         lost = [_reject(claim.source, reason, claim.mask) for claim, reason in dropped]
         seconds = dict(sight.watch.spent)
         found = tuple(_detection(claim) for claim in kept)
-        return Detections(found, (*rejected, *lost), sight.proposals, sight.similarity, seconds)
+        return Detections(found, (*rejected, *lost), sight.proposals, sight.similarity, sight.scene, seconds)
 
     def _glance_all(self, crops: Sequence[Crop], watch: Stopwatch) -> Signature:
         encoder = self.estimator.encoder
@@ -359,6 +363,7 @@ def _usable_zoom(templates: Templates, resolution: int, zoom: int) -> int:
 
 def _thinned(templates: Templates, info: ObjectInfo, count: int) -> tuple[Templates, ObjectInfo]:
     """With fewer templates, and the pictures of those."""
+    templates = compact(templates, multiple=MULTIPLE)
     if templates.reference is not None:  # the views of a photo are few, and around it
         return templates, info
     templates, kept = thin_templates(templates, count)

@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 from ipjax.config import DetectConfig
 from ipjax.records import Camera, Similarity, Templates
 
-CLOSING = 5  # pixels on a side of the square that closes gaps between drawn points
-FEW = 20_000  # points below which each is drawn larger
+CLOSING = 2  # pixels: half the side, less a half, of the square that closes gaps between drawn points
+MOST = 6  # the same, for objects of few points
 
 
 @functools.partial(jax.jit, static_argnames="radius")
@@ -23,25 +23,28 @@ def draw_mask(
     camera: Camera,
     depth: Float[Array, "h w"],
     tolerance: Float[Array, ""],
-    radius: int = 1,
+    radius: int = CLOSING,
 ) -> tuple[Bool[Array, "h w"], Bool[Array, "h w"]]:
     """Where points are drawn at a pose, and where of that the depth agrees within ``tolerance`` (metres) or is unknown.
 
     Args:
       depth: of the image, metres; 0 = unknown.
-      radius: pixels by which each point is enlarged.
+      radius: gaps between points up to twice as many pixels wide are closed.
     """
     height, width = depth.shape
     placed = camera_from_object @ points
     everything = jnp.ones(points.shape[0], bool)
-    predicted = splat_depth(placed, everything, camera.focal, camera.centre, height, width, radius)
-    # Closed: gaps between points, but nothing of the outline, take the depth of the nearest points around them.
-    near = jnp.where(predicted > 0, predicted, jnp.inf)
-    window = lambda x, start, take: lax.reduce_window(x, start, take, (CLOSING, CLOSING), (1, 1), "SAME")
-    around = window(near, jnp.inf, lax.min)
-    filled = window(jnp.isfinite(around).astype(jnp.float32), 1.0, lax.min) > 0.5
-    surface = jnp.where(predicted > 0, predicted, around)
-    off = (depth > 0) & (jnp.abs(depth - surface) > tolerance)
+    drawn = functools.partial(splat_depth, placed, everything, camera.focal, camera.centre, height, width)
+    # Every point enlarged and the outline shrunk again: closed, and no larger than the points.
+    wide = drawn(radius=radius)
+    side = 2 * radius + 1
+    filled = lax.reduce_window((wide > 0).astype(jnp.float32), 1.0, lax.min, (side, side), (1, 1), "SAME") > 0.5
+    # Where the surface is steep, depth changes by more than the tolerance from pixel to pixel: all that is drawn within
+    # a pixel is its depth, but for what shows through gaps. Wide windows are only for those.
+    near, exact = drawn(radius=1), drawn(radius=0)
+    far = lax.reduce_window(exact, 0.0, lax.max, (3, 3), (1, 1), "SAME")
+    near, far = jnp.where(near > 0, near, wide), jnp.where(near > 0, jnp.minimum(far, near + tolerance), wide)
+    off = (depth > 0) & ((depth < near - tolerance) | (depth > far + tolerance))
     return filled, filled & ~off
 
 
@@ -65,7 +68,12 @@ def mask_from_pose(
     guessed = templates.reference is not None and not templates.reference.measured
     share = config.guessed_tolerance if guessed else config.tolerance
     tolerance = max(share * float(camera_from_object.scale), config.least_tolerance)
-    radius = 1 if points.shape[0] > FEW else 4
+    # Half of the points are in view, on about half of the square around the object; a point for each such square.
+    area = (
+        0.5
+        * (float(camera_from_object.scale) * matrix[0, 0] / max(float(camera_from_object.translation[2]), 1e-3)) ** 2
+    )
+    radius = int(np.clip(np.ceil(np.sqrt(2 * area / points.shape[0])), CLOSING, MOST))
     pose = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), camera_from_object)
     whole, visible = draw_mask(
         jnp.asarray(points, jnp.float32),

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ipjax.detection.crops import Scene
 from ipjax.inference.estimator import Result
 
 
@@ -57,6 +58,7 @@ class Detections(Sequence[Detection]):
     rejected: tuple[Rejected, ...]
     proposals: Any  # `ipjax.detection.proposals.propose.Proposals`
     similarity: Float[np.ndarray, "o n"]  # of each object and proposal; -inf where a proposal could not be used
+    scene: Scene  # the frame without lens distortion, which masks and poses are of
     seconds: dict[str, float]  # of each stage; compile where it happened
 
     def __len__(self) -> int:

@@ -4,13 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import resize
 from ipjax.detection.colours import crop_histogram, template_histograms
 from ipjax.estimation.features import describe
 from ipjax.estimation.matching import CELLS
-from ipjax.records import Camera, Patches, Templates, View
+from ipjax.records import Patches, Templates, View
 
 
 class Signature(eqx.Module):
@@ -43,7 +43,7 @@ def glance(encoder, view: View, zoom: int) -> Signature:
     known = (blocks(view.depth) > 0) & shown
     depth = jnp.sum(jnp.where(known, blocks(view.depth), 0), axis=(1, 3))
     depth = depth / jnp.maximum(jnp.sum(known, axis=(1, 3), dtype=depth.dtype), 1)
-    camera: Camera = resize(view.camera, (width, height), (small[1], small[0]))
+    camera = resize(view.camera, (width, height), (small[1], small[0]))
     reduced = View(jnp.mean(blocks(view.rgb), axis=(1, 3)), depth, jnp.any(shown, axis=(1, 3)), camera)
     found = crop_signature(describe(encoder, reduced), reduced)
     return eqx.tree_at(lambda s: s.colours, found, crop_histogram(view))
@@ -58,7 +58,7 @@ def template_signatures(templates: Templates) -> Signature:
         features, norm, grid, valid = template
         share = _cells_of(grid, valid)
         # Without their mean, cut and of unit length, as they are stored; and back.
-        rest = jnp.where(valid[:, None], features, 0).astype(jnp.float32) * norm[:, None]
+        rest = jnp.where(valid[:, None], features, 0).astype(jnp.float32) * norm[:, None].astype(jnp.float32)
         sums = jnp.dot(share, rest, precision="highest")
         sums = sums if basis is None else jnp.matmul(sums, basis, precision="highest")
         return sums + jnp.sum(share, axis=1, keepdims=True) * templates.mean
@@ -71,7 +71,7 @@ def template_signatures(templates: Templates) -> Signature:
 
 def _cells_of(grid: Float[Array, "p 2"], valid: Bool[Array, "p"]) -> Float[Array, "k p"]:
     """1 where a patch lies in a cell and is valid."""
-    place: Int[Array, "p 2"] = jnp.floor(grid * (CELLS / (jnp.max(grid, initial=0) + 1)) + 1e-4).astype(jnp.int32)
+    place = jnp.floor(grid * (CELLS / (jnp.max(grid, initial=0) + 1)) + 1e-4).astype(jnp.int32)
     cell = place[:, 1] * CELLS + place[:, 0]
     return ((jnp.arange(CELLS**2, dtype=jnp.int32)[:, None] == cell) & valid).astype(jnp.float32)
 

@@ -70,6 +70,7 @@ def draw(
     evidence: Evidence | Sequence[Evidence | None] | None = None,
     *,
     extents: Sequence[np.ndarray] | None = None,
+    masks: Sequence[Bool[np.ndarray, "h w"] | None] | None = None,
     height: int = 900,
 ) -> UInt8[np.ndarray, "h2 w2 3"]:
     """A picture that shows whether an estimate is right.
@@ -80,6 +81,7 @@ def draw(
         estimates, objects: one or several, in the same order.
         evidence: crop, template and pairs of each, from `gather_evidence`.
         extents: sides of the box in model units, where the object file keeps no mesh.
+        masks: of each, where it was found; drawn with its name and confidence. Of the image without lens distortion.
         height: of the picture in pixels.
 
     Returns:
@@ -107,6 +109,10 @@ def draw(
         colours=[PALETTE[i % len(PALETTE)] for i, s in enumerate(shown) if s],
         height=height,
     )
+    for i, mask in enumerate(masks or ()):
+        if mask is not None and mask.any():
+            label = f"{objects[i].name} {float(estimates[i].confidence):.2f}"
+            _draw_mask(photo, mask, label, PALETTE[i % len(PALETTE)])
     cards = [
         draw_card(estimate, info, one, PALETTE[i % len(PALETTE)], compact=len(objects) > 1)
         for i, (estimate, info, one) in enumerate(zip(estimates, objects, evidence, strict=True))
@@ -190,6 +196,23 @@ def write_image(path: str | Path, image: np.ndarray) -> None:
         raise ValueError(f"{path}: pictures are written as .png or .jpg")
     with writing(path) as temporary:
         Image.fromarray(image).save(temporary, kind, **({"quality": 92} if kind == "JPEG" else {}))
+
+
+def _draw_mask(image: np.ndarray, mask: np.ndarray, label: str, colour) -> None:
+    """A dotted outline of a mask, which may be of another size, and a label above it."""
+    height, width = image.shape[:2]
+    enlarged = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    contours, _ = cv2.findContours(enlarged, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    stroke = max(round(height / 450), 1)
+    for contour in contours:
+        for x, y in contour[:: 5 * stroke, 0]:
+            cv2.circle(image, (int(x), int(y)), stroke, colour, -1, cv2.LINE_AA)
+    x, y, _, _ = cv2.boundingRect(enlarged)
+    canvas = Image.fromarray(image)
+    pen = ImageDraw.Draw(canvas)
+    place = (x, max(y - 4 * stroke, 12 * stroke))
+    pen.text(place, label, colour, find_font(10 * stroke), "lb", stroke_width=2, stroke_fill=(10, 10, 10))
+    image[:] = np.asarray(canvas)
 
 
 def _line(image: np.ndarray, a: np.ndarray, b: np.ndarray, colour, width: int, reach: float = 1e5) -> None:

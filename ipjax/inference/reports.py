@@ -160,6 +160,18 @@ def estimate_as_json(estimate: PoseEstimate, templates: Templates, info: ObjectI
     return entry
 
 
+def nothing_as_json(name: str) -> dict[str, Any]:
+    """As `estimate_as_json`, of an object that was sought in vain."""
+    return {
+        "object": name,
+        "success": False,
+        "present": False,
+        "confidence": 0.0,
+        "camera_from_mesh": None,
+        "camera_from_object": None,
+    }
+
+
 def to_json(value: Any) -> str:
     """JSON with short lists of numbers on one line each, so that matrices can be read.
 

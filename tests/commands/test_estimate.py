@@ -42,7 +42,6 @@ MALFORMED = {
     "no object file": (None, {"object": "none.ipjax"}, (), "no such object file"),
     "no camera file": (None, {"camera": "none.json"}, (), "no such camera file"),
     "no depth option": (None, {"depth": None}, (), "--depth"),
-    "no mask, no box": (None, {"mask": None}, (), "--mask or --box"),
     "rgb is text": (text("rgb.png", "hello"), {}, (), "not an image"),
     "rgb truncated": (cut("rgb.png", 900), {}, (), "broken image"),
     "rgb and depth differ": (image(FLAT_MM[:48], "depth.png"), {}, (), "align the depth"),

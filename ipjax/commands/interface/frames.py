@@ -61,7 +61,7 @@ def list_frames(arguments: argparse.Namespace) -> list[FrameFiles]:
         camera = next((str(folder / name) for name in CAMERAS if (folder / name).is_file()), None)
         if camera is None:
             raise ValueError(f"{folder}: no camera file in it ({', '.join(CAMERAS)}); give --camera")
-    if _mask_folder(folder) is None:
+    if _mask_folder(folder) is None and (arguments.instance or arguments.obj_id or arguments.mask_label):
         raise ValueError(f"{folder}: no masks in mask/, masks/ or mask_visib/")
     frames = []
     for path in found:
@@ -77,10 +77,10 @@ def _single_frame(arguments: argparse.Namespace) -> FrameFiles:
     if missing:
         raise ValueError(f"a frame needs {', '.join(missing)} (or give --frames FOLDER)")
     masks, boxes = arguments.mask or [], arguments.box or []
-    if len(masks) not in (0, count) or len(boxes) not in (0, count) or not (masks or boxes):
+    if len(masks) not in (0, count) or len(boxes) not in (0, count):
         raise ValueError(
-            f"{count} object{'s need as many' if count > 1 else ' needs one'} --mask or --box, in the same order; "
-            f"got {len(masks)} and {len(boxes)}"
+            f"{count} object{'s need as many' if count > 1 else ' needs one'} --mask or --box, in the same order, or "
+            f"none at all; got {len(masks)} and {len(boxes)}"
         )
     return FrameFiles(
         arguments.rgb.stem,
@@ -99,7 +99,8 @@ def _mask_folder(folder: Path) -> Path | None:
 
 
 def choose_masks(frames: list[FrameFiles], names: list[str], arguments: argparse.Namespace) -> None:
-    """Fill in the masks of a folder's frames; a frame without a usable mask says why in its ``error``.
+    """Fill in the masks of a folder's frames; a frame without a usable mask says why in its ``error``. In a folder
+    that has no masks at all the objects are sought, and nothing is filled in.
 
     Args:
         frames: of `list_frames`.
@@ -111,7 +112,8 @@ def choose_masks(frames: list[FrameFiles], names: list[str], arguments: argparse
 
     folder, count = arguments.frames, len(names)
     masks = _mask_folder(folder)
-    assert masks is not None
+    if masks is None:  # the objects are sought without
+        return
     truth, about = folder / "scene_gt.json", folder / "scene_gt_info.json"
     scene = read_json(truth) if truth.is_file() and not arguments.instance else None
     shares = read_json(about) if about.is_file() else {}

@@ -1,0 +1,172 @@
+"""Objects of a frame that no mask was given for: where they were found, and what is told of it."""
+
+import argparse
+import dataclasses
+import time
+from typing import Any
+
+from ipjax.commands.interface.frames import FrameFiles, Images
+from ipjax.commands.interface.messages import Messages
+
+ALL = "all"
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """An object's estimate in a frame, in the mask that was found for it."""
+
+    index: int  # of the object
+    result: Any  # `ipjax.inference.estimator.Result`; None where nothing was found
+    mask: Any  # height × width, of the image without lens distortion
+    seconds: float  # of cutting it out
+    diameter: float | None  # that was given
+    about: dict[str, Any] | None  # how the mask was found, as JSON
+
+
+def parse_instances(text: str) -> int | None:
+    """``--instances``: a number from 1 on, or "all", which is None."""
+    if text == ALL:
+        return None
+    try:
+        count = int(text)
+    except ValueError:
+        count = 0
+    if count < 1:
+        raise argparse.ArgumentTypeError(f"a number from 1 on, or {ALL!r}, not {text!r}")
+    return count
+
+
+def is_without_masks(files: FrameFiles) -> bool:
+    """No mask and no box says where the objects are."""
+    return not any(mask is not None for mask in files.masks) and not any(box is not None for box in files.boxes)
+
+
+def make_detector(objects: list[tuple[Any, Any]], encoder: Any, *, quick: bool, crop: str) -> Any:
+    """An `ipjax.Detector` of the objects of the command line."""
+    from ipjax.detection.detector import Detector
+
+    return Detector(objects, encoder, quick=quick, crop=crop)
+
+
+def detect_frame(
+    name: str,
+    images: Images,
+    detector: Any,
+    estimator: Any,
+    diameters: list[float | None],
+    arguments: argparse.Namespace,
+    messages: Messages,
+) -> tuple[list[Found], dict[str, Any]]:
+    """Find the objects, and estimate each in the mask that was found, with the settings that were asked for.
+
+    Returns:
+        For each object, in their order, its instances, the surest first: the best guess, and of several those that are
+        present; and what was rejected, as JSON.
+    """
+    from ipjax.detection.crops import cut_crop
+
+    messages.print_notes()
+    start = time.perf_counter()
+    detections = detector.detect(
+        images.rgb,
+        images.depth,
+        images.camera,
+        instances=arguments.instances,
+        diameters=diameters,
+        depth_scale=arguments.depth_scale,
+        seed=arguments.seed,
+        progress=not arguments.quiet,
+    )
+    spent = time.perf_counter() - start
+    found = []
+    for index, (_, info) in enumerate(estimator.objects):
+        mine = [one for one in detections if one.index == index]
+        kept = [one for number, one in enumerate(mine) if number == 0 or one.present]
+        for one in kept:
+            start = time.perf_counter()
+            crop = cut_crop(detections.scene, one.mask, resolution=info.resolution, crop=arguments.crop)
+            if crop is None:
+                continue
+            seconds = time.perf_counter() - start
+            given = {"seed": arguments.seed, "diameter": diameters[index]}
+            result = estimator.run(index, crop.view, crop.camera_from_crop, **given)
+            found.append(Found(index, result, one.mask, seconds, diameters[index], _about(one)))
+        if not kept:
+            found.append(Found(index, None, None, 0.0, diameters[index], None))
+    count = len(detections.proposals.masks)
+    many = f"{len(found)} masks were" if len(found) != 1 else "the mask was"
+    messages.note(f"{name}: {many} found, not given: {count} proposals, ranked and verified in {spent:.1f} s")
+    return found, {
+        "proposals": count,
+        "seconds": {stage: round(seconds, 6) for stage, seconds in detections.seconds.items()},
+        "rejected": [
+            {
+                "object": one.name,
+                "proposal": one.proposal,
+                "similarity": one.similarity,
+                "confidence": one.confidence,
+                "score": one.score,
+                "reason": one.reason,
+            }
+            for one in detections.rejected
+        ],
+    }
+
+
+def _about(one: Any) -> dict[str, Any]:
+    from ipjax.files.images.run_lengths import encode_rle
+
+    return {
+        "how": "a proposal that looks like the object, verified by its pose; the mask is that of the pose",
+        "score": one.score,
+        "confidence": one.confidence,
+        "box": list(one.box),
+        "mask": encode_rle(one.mask),
+        "proposal": one.proposal,
+        "similarity": one.similarity,
+        "overlap_with_proposal": one.overlap,
+    }
+
+
+def mend_mask(
+    name: str,
+    images: Images,
+    estimator: Any,
+    index: int,
+    first: Any,
+    mask: Any,
+    messages: Messages,
+    depth_scale: float | None,
+    **options: Any,
+) -> tuple[Any, dict[str, Any] | None, Any]:
+    """``--mask-is-rough``: estimate again in the mask of the pose.
+
+    Returns:
+        The surer result, what changed as JSON (None where there is no mask to mend), and the mask.
+    """
+    from ipjax.detection.crops import read_scene, undistort_mask
+    from ipjax.detection.rough import estimate_again
+    from ipjax.files.images.run_lengths import encode_rle
+
+    info = estimator.objects[index][1]
+    scene = read_scene(images.rgb, images.depth, images.camera, depth_scale)
+    given = undistort_mask(mask, images.camera)
+    mended = estimate_again(estimator, index, scene, given, first, **options)
+    if mended is None:
+        messages.note(f"{name}: {info.name}: the mask was kept: its pose gives none")
+        return first, None, given
+    after = float(mended.result.estimate.confidence)
+    outcome = f"confidence {mended.before:.2f} → {after:.2f}" if mended.used else "kept as it was: it is the surer one"
+    messages.note(
+        f"{name}: {info.name}: of the mask {mended.removed} pixels are not the object's and {mended.added} are missing "
+        f"(overlap {mended.overlap:.2f}); {outcome}"
+    )
+    about = {
+        "overlap": mended.overlap,
+        "added_pixels": mended.added,
+        "removed_pixels": mended.removed,
+        "used": mended.used,
+        "confidence_before": mended.before,
+        "mask": encode_rle(mended.mask),
+    }
+    return mended.result, about, mended.mask if mended.used else given

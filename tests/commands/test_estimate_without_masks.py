@@ -1,0 +1,94 @@
+"""``ipjax estimate`` without a mask: the object is sought, told and drawn; and a rough mask is mended."""
+
+import dataclasses
+import json
+
+import cv2
+import equinox as eqx
+import numpy as np
+import pytest
+from builders import detections
+from builders.command_lines import run
+from builders.tiny_pipeline import DRAWN
+from PIL import Image
+
+from ipjax.commands.interface import options
+from ipjax.files.images.run_lengths import decode_rle
+from ipjax.files.objects.saving import save
+from ipjax.synthetic.problems import CoordinateEncoder, make_encoder
+
+
+class Named(CoordinateEncoder):
+    """The tests' encoder with an identity, as object files want it."""
+
+    identity: str = eqx.field(static=True, default="coordinates")
+
+
+@pytest.fixture
+def scene(tmp_path, monkeypatch):
+    """A folder with an object file and a frame of two of it, and the words that name them."""
+    monkeypatch.setenv("IPJAX_NO_CACHE", "1")
+    plain = make_encoder()
+    encoder = Named(plain.frequencies, plain.phases)
+    monkeypatch.setattr("ipjax.files.weights.matching.load_matching_encoder", lambda *_: encoder)
+    monkeypatch.setattr("ipjax.config.Config.fast", lambda: DRAWN)
+    monkeypatch.setattr(options, "read_config", lambda arguments: DRAWN)
+    templates, info = detections.ellipsoid()
+    vertices = np.asarray(templates.appearance.points[::40], np.float32)
+    save(tmp_path / "mug.ipjax", templates, dataclasses.replace(info, encoder="coordinates", vertices=vertices))
+    frame = detections.make_frame(detections.place(-0.12, 0.0, seed=1), detections.place(0.12, 0.02, seed=2))
+    Image.fromarray(frame.rgb).save(tmp_path / "rgb.png")
+    np.save(tmp_path / "depth.npy", frame.depth)
+    (tmp_path / "camera.json").write_text(json.dumps({"cam_K": detections.MATRIX.ravel().tolist()}))
+    words = ["estimate", tmp_path / "mug.ipjax", "--rgb", tmp_path / "rgb.png", "--depth", tmp_path / "depth.npy"]
+    return tmp_path, [*map(str, words), "--camera", str(tmp_path / "camera.json")], frame
+
+
+def overlap(mask, truth) -> float:
+    return (mask & truth).sum() / (mask | truth).sum()
+
+
+def test_objects_are_sought_where_no_mask_is_given(scene, capfd):
+    folder, words, frame = scene
+    assert run([*words, "--instances", "all", "--json", "--overlay", str(folder / "out.png")]) == 0
+    out, error = capfd.readouterr()
+    (told,) = json.loads(out)["frames"]
+    assert "2 masks were found, not given" in error
+    assert [one["present"] for one in told["objects"]] == [True, True]
+    masks = [decode_rle(one["detected"]["mask"]) for one in told["objects"]]
+    for truth in frame.masks:
+        assert sum(overlap(mask, truth) > 0.8 for mask in masks) == 1
+    one = told["objects"][0]
+    assert one["mask"] is None and "verified by its pose" in one["detected"]["how"]
+    assert one["object_file"].endswith("mug.ipjax") and len(one["detected"]["box"]) == 4
+    assert told["detection"]["proposals"] > 0 and all(r["reason"] for r in told["detection"]["rejected"])
+    assert np.asarray(Image.open(folder / "out.png")).std() > 20
+
+
+def test_a_rough_mask_is_mended_and_it_is_said(scene, capfd):
+    folder, words, frame = scene
+    wide = cv2.dilate(frame.masks[0].astype(np.uint8), np.ones((17, 17), np.uint8))
+    Image.fromarray(255 * wide).save(folder / "wide.png")
+    assert run([*words, "--mask", str(folder / "wide.png"), "--mask-is-rough", "--json"]) == 0
+    out, error = capfd.readouterr()
+    (one,) = json.loads(out)["frames"][0]["objects"]
+    assert "of the mask" in error and "pixels are not the object's" in error
+    mended = one["mended_mask"]
+    before = overlap(wide > 0, frame.masks[0])
+    assert overlap(decode_rle(mended["mask"]), frame.masks[0]) > before + 0.1
+    assert mended["removed_pixels"] > mended["added_pixels"]
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--instances", "0"), "a number from 1 on, or 'all'"),
+        (("--mask-is-rough",), "needs a --mask"),
+        (("--mask", "rgb.png", "--instances", "2"), "for objects that are sought"),
+        (("--depth-scale", "-1"), "positive"),
+    ],
+)
+def test_what_cannot_be_is_refused(scene, capfd, more, words):
+    _, given, _ = scene
+    assert run([*given, *more]) == 2
+    assert words in capfd.readouterr().err

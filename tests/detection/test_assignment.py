@@ -1,0 +1,59 @@
+"""One thing is one object, one instance is found once, and turns of a symmetric shape are one pose."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from builders.detections import ellipsoid, place
+
+from ipjax.detection.assignment import Claim, assign, overlap, same_instance, shared_share
+from ipjax.records import Similarity
+
+
+def square(left: int, right: int) -> np.ndarray:
+    mask = np.zeros((20, 60), bool)
+    mask[:, left:right] = True
+    return mask
+
+
+def claim(index: int, mask: np.ndarray, confidence: float, x: float) -> Claim:
+    return Claim(index, f"object {index}", mask, place(x, 0.0), confidence, confidence)
+
+
+def test_the_surest_claim_of_a_place_holds():
+    templates = [ellipsoid()[0]] * 2
+    claims = [
+        claim(0, square(0, 10), 0.6, -0.4),
+        claim(1, square(0, 9), 0.9, -0.4),  # the same place, surer
+        claim(0, square(30, 40), 0.5, 0.4),
+        claim(0, square(31, 40), 0.4, 0.41),  # the same instance once more
+        claim(1, square(44, 60), 0.3, 0.9),  # a second instance, of one that is wanted once
+    ]
+    kept, dropped = assign(claims, templates, instances=1, taken=0.5, apart=0.1)
+    assert [(one.index, one.confidence) for one in kept] == [(1, 0.9), (0, 0.5)]
+    reasons = {one.confidence: reason for one, reason in dropped}
+    assert "taken by object 1" in reasons[0.6]
+    assert "same instance" in reasons[0.4] and "1 surer instance was" in reasons[0.3]
+    kept, _ = assign(claims, templates, instances=3, taken=0.5, apart=0.1)
+    assert len(kept) == 3
+    # The order in which they come does not matter.
+    assert [id(one) for one in assign(claims[::-1], templates, instances=3, taken=0.5, apart=0.1)[0]] == [
+        id(one) for one in kept
+    ]
+
+
+def test_turns_after_which_a_shape_looks_the_same_are_one_instance():
+    templates, pose = ellipsoid()[0], place(0.0, 0.0)
+    half = jnp.asarray(np.diag([-1.0, -1.0, 1.0]), jnp.float32)
+    turned = dataclasses.replace(pose, rotation=pose.rotation @ half)
+    assert same_instance(templates, pose, turned, 0.1)
+    moved = Similarity(pose.rotation, pose.translation + jnp.array([0.9 * 0.2, 0.0, 0.0]), pose.scale)
+    assert not same_instance(templates, pose, moved, 0.1)
+    assert jax.tree.all(jax.tree.map(np.array_equal, pose, place(0.0, 0.0)))
+
+
+def test_shares_of_masks():
+    assert shared_share(square(0, 10), square(5, 30)) == 0.5
+    assert overlap(square(0, 10), square(5, 15)) == 5 / 15
+    assert shared_share(square(0, 0), square(0, 10)) == overlap(square(0, 0), square(0, 0)) == 0

@@ -1,0 +1,76 @@
+"""Objects are found in made frames without a mask: alone, several at once, several of one, and what is not there."""
+
+import numpy as np
+import pytest
+from builders.detections import HEIGHT, MATRIX, WIDTH, detector, ellipsoid, make_frame, place
+from builders.tiny_pipeline import assert_near
+
+from ipjax.detection.assignment import overlap
+
+
+def test_an_object_is_found_with_its_pose_and_mask():
+    frame = make_frame(place(-0.12, 0.05))
+    sought = detector()
+    found = sought.detect(frame.rgb, frame.depth, MATRIX)
+    first = found[0]
+    assert (first.name, first.index) == ("ellipsoid", 0)
+    assert overlap(first.mask, frame.masks[0]) > 0.85
+    assert_near(first.result.estimate.camera_from_object, frame.poses[0], 0.08, 0.1, 20)
+    x, y, width, height = first.box
+    inside = np.zeros_like(first.mask)
+    inside[y : y + height, x : x + width] = True
+    assert first.mask.any() and not (first.mask & ~inside).any()
+    assert first.score <= first.confidence and found.seconds["verify"] > 0
+    assert found.similarity.shape == (2, len(found.proposals.masks))
+    # Everything that was tried is told, with a reason, and only one object can have the pixels.
+    assert all(one.reason for one in found.rejected)
+    assert not any(overlap(one.mask, first.mask) > 0.5 for one in found[1:])
+
+
+def test_two_instances_that_touch_are_two_and_none_is_found_twice():
+    frame = make_frame(place(-0.075, 0.0, seed=1), place(0.085, 0.02, seed=2))
+    found = [
+        one for one in detector().detect(frame.rgb, frame.depth, MATRIX, instances=None) if one.name == "ellipsoid"
+    ]
+    assert len([one for one in found if one.present]) == 2
+    for mask in frame.masks:
+        assert sum(overlap(one.mask, mask) > 0.6 for one in found) == 1
+
+
+def test_a_known_size_is_evidence_and_same_seed_gives_same_answer():
+    frame = make_frame(place(0.05, -0.02, seed=3))
+    sought = detector()
+    sight = sought.look(frame.rgb, frame.depth, MATRIX)
+    free, right, wrong = (sought.seek(sight, 0, diameter=size)[0] for size in (None, 0.2, 0.3))
+    assert right[0].value > 0.5 * free[0].value and right[0].value <= free[0].value
+    assert wrong[0].value < 0.01 * free[0].value
+    again = sought.seek(sight, 0)[0]
+    assert np.array_equal(again[0].pose.rotation, free[0].pose.rotation) and again[0].value == free[0].value
+
+
+def test_frames_that_cannot_be_searched_are_refused_in_words():
+    frame, sought = make_frame(), detector()
+    with pytest.raises(ValueError, match="depth image is empty"):
+        sought.detect(frame.rgb, 0 * frame.depth, MATRIX)
+    with pytest.raises(ValueError, match="but depth is"):
+        sought.detect(frame.rgb, frame.depth[:100], MATRIX)
+    with pytest.raises(ValueError, match="at least one instance"):
+        sought.detect(frame.rgb, frame.depth, MATRIX, instances=0)
+    with pytest.raises(ValueError, match="2 objects and 1 diameters"):
+        sought.detect(frame.rgb, frame.depth, MATRIX, diameters=[0.1])
+    with pytest.raises(ValueError, match="at least one object"):
+        type(sought)([], None)
+
+
+def test_nothing_is_present_before_a_bare_wall():
+    frame = make_frame()
+    found = detector().detect(frame.rgb, frame.depth, MATRIX)
+    assert not any(one.present for one in found)
+    assert found.similarity.shape[0] == 2 and frame.depth.shape == (HEIGHT, WIDTH)
+
+
+def test_an_object_keeps_its_own_templates():
+    """Thinning and padding leave what the caller gave as it was."""
+    templates, info = ellipsoid()
+    assert templates.norm.shape[0] == 80 and detector().names == ["ellipsoid", "stranger"]
+    assert info.resolution == 112
