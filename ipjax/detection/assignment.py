@@ -25,7 +25,7 @@ class Claim:
     mask: Bool[np.ndarray, "h w"]
     pose: Similarity  # camera_from_object
     confidence: float
-    value: float  # what claims of one object are sorted by
+    value: float  # what claims are sorted by
     source: Any = None  # what the caller knows it by
 
 
@@ -68,16 +68,16 @@ def assign(
 ) -> tuple[list[Claim], list[tuple[Claim, str]]]:
     """Those claims that hold, the surest first, and the others with the reason.
 
-    The claim of highest confidence holds first; then the next one whose place is not taken: by itself (the same pose
-    within ``apart`` diameters, or more than ``taken`` of the smaller mask), or by another object. By confidence, not by
-    similarity of the crop: assigning objects by that lowered the precision.
+    The claim of highest value holds first; then the next one whose place is not taken: by its own object (the same pose
+    within ``apart`` diameters, or more than ``taken`` of the smaller mask), or by another. By what the poses are worth,
+    not by how alike the crops are: objects assigned by that were less precise.
 
     Args:
       instances: of an object, at most; one number for all, or one for each.
     """
     kept: list[Claim] = []
     dropped: list[tuple[Claim, str]] = []
-    for claim in sorted(claims, key=lambda one: (-one.confidence, -one.value)):
+    for claim in sorted(claims, key=lambda one: -one.value):
         mine = [one for one in kept if one.index == claim.index]
         again = next((one for one in mine if _is_same(claim, one, templates, taken, apart)), None)
         other = next((one for one in kept if shared_share(one.mask, claim.mask) > taken), None)

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from ipjax.detection.signatures import Signature
 from ipjax.files.cameras.reading import as_intrinsics
 from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import remove_sentinel
@@ -31,6 +32,7 @@ class Crop:
     view: View
     camera_from_crop: Similarity
     patches: Patches | None = None
+    signature: Signature | None = None
 
 
 def read_scene(rgb: Any, depth: Any, camera: Any, depth_scale: float | None = None) -> Scene:

@@ -9,32 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from ipjax.config import Config, DetectConfig
-from ipjax.detection.assignment import Claim, assign, overlap, same_instance
+from ipjax.detection.assignment import Claim, assign
 from ipjax.detection.crops import Crop, Scene, cut_crop, read_scene
-from ipjax.detection.masks import mask_from_pose
 from ipjax.detection.proposals.propose import ProposalConfig, Proposals, propose
-from ipjax.detection.records import Detection, Detections, Rejected
-from ipjax.detection.signatures import Signature, glance, similarity, template_signatures
+from ipjax.detection.records import Detections, Rejected
+from ipjax.detection.signatures import Signature, crop_signature, glance, similarity, template_signatures
 from ipjax.detection.stopwatch import Stopwatch
-from ipjax.estimation.features import describe
+from ipjax.detection.verification import Candidate, Verifier, as_detection, describe_crop, reject
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.batching import compact, thin_templates
-from ipjax.inference.estimator import MULTIPLE, Estimator, Result
+from ipjax.inference.estimator import MULTIPLE, Estimator
 from ipjax.progress import bar
-from ipjax.records import PoseEstimate, Templates
-
-
-@dataclasses.dataclass(frozen=True)
-class _Trial:
-    """A proposal (or what a pose made of it) that was estimated as an object."""
-
-    index: int
-    proposal: int
-    similarity: float
-    crop: Crop
-    result: Result
-    value: float  # confidence × score, and how well a known size agrees
-    proposed: np.ndarray  # the proposal's mask
+from ipjax.records import Templates
 
 
 @dataclasses.dataclass
@@ -176,12 +162,15 @@ class Detector:
         Returns:
             Poses with the pixels that they claim, and what was given up.
         """
-        rejected: list[Rejected] = []
-        with sight.watch("rank"):
-            self._rank(sight, index)
-        first = self._verify(sight, index, instances, diameter, seed)
-        mended = self._mend(sight, first, instances, diameter, seed, rejected)
-        return self._claims(sight, mended, rejected), rejected
+        order = self._rank(sight, index)[: self.detection.verified + 2 * (instances - 1)]
+        candidates = [
+            Candidate(index, i, float(sight.similarity[index, i]), sight.proposals.masks[i], crop)
+            for i in order
+            if (crop := sight.crops[i]) is not None
+        ]
+        about = self.estimator, self.detection, self.options, sight.scene, sight.watch
+        verifier = Verifier(*about, diameter=diameter, seed=seed)
+        return verifier.verify(candidates, instances), verifier.rejected
 
     def choose(
         self,
@@ -200,9 +189,9 @@ class Detector:
                 taken=self.detection.taken,
                 apart=self.detection.same,
             )
-        lost = [_reject(claim.source, reason, claim.mask) for claim, reason in dropped]
+        lost = [reject(claim.source, reason, claim.mask) for claim, reason in dropped]
         seconds = dict(sight.watch.spent)
-        found = tuple(_detection(claim) for claim in kept)
+        found = tuple(as_detection(claim) for claim in kept)
         return Detections(found, (*rejected, *lost), sight.proposals, sight.similarity, sight.scene, seconds)
 
     def _glance_all(self, crops: Sequence[Crop], watch: Stopwatch) -> Signature:
@@ -216,141 +205,40 @@ class Detector:
         found += [found[0]] * (-len(found) % _BUCKET)
         return jax.block_until_ready(jax.tree.map(lambda *x: jnp.stack(x), *found))
 
-    def _rank(self, sight: Sight, index: int) -> None:
-        """Similarity of an object to every crop."""
+    def _rank(self, sight: Sight, index: int) -> list[int]:
+        """The proposals most like an object, the best first: chosen at a glance, ranked by whole crops."""
         if sight.signatures is None:
-            return
+            return []
         if index not in self._signatures:
             self._signatures[index] = jax.block_until_ready(_template_signatures(self.estimator.objects[index][0]))
-        settings = self.detection
-        found = _similarity(self._signatures[index], sight.signatures, settings.alike, settings.colour)
-        sight.similarity[index, sight.used] = np.asarray(found)[: len(sight.used)]
+        settings, mine = self.detection, sight.similarity[index]
 
-    def _verify(self, sight: Sight, index: int, instances: int, diameter: float | None, seed: int) -> list[_Trial]:
-        """An object estimated in the proposals that are most like it, the best first."""
-        ranks = sight.similarity[index]
-        order = [int(i) for i in np.argsort(-ranks, kind="stable") if np.isfinite(ranks[i])]
-        trials = []
-        for proposal in order[: self.detection.verified + 2 * (instances - 1)]:
-            crop = sight.crops[proposal]
-            assert crop is not None
-            known = float(ranks[proposal])
-            trials.append(self._try(index, proposal, known, crop, diameter, seed, sight, "verify"))
-        return sorted(trials, key=lambda one: -one.value)
+        def rate(crops: Signature) -> np.ndarray:
+            with sight.watch("rank"):
+                found = _similarity(self._signatures[index], crops, settings.alike, settings.colour)
+                return np.asarray(found)
 
-    def _try(
-        self,
-        index: int,
-        proposal: int,
-        alike: float,
-        crop: Crop,
-        diameter: float | None,
-        seed: int,
-        sight: Sight,
-        stage: str,
-    ) -> _Trial:
-        estimator, watch = self.estimator, sight.watch
-        with watch("describe"):
-            if crop.patches is None:
-                run = estimator.compiled("describe", describe, watch.spent, estimator.encoder, crop.view)
-                crop.patches = jax.block_until_ready(run(estimator.encoder, crop.view))
-        with watch(stage):
-            result = estimator.run(index, crop.view, crop.camera_from_crop, seed=seed, patches=crop.patches)
-        watch.move("compile", result.seconds.get("compile", 0.0), stage)
-        value = self._value(result.estimate, diameter)
-        return _Trial(index, proposal, alike, crop, result, value, sight.proposals.masks[proposal])
+        mine[sight.used] = rate(sight.signatures)[: len(sight.used)]
+        best = [int(i) for i in np.argsort(-mine, kind="stable")[: settings.shortlist] if np.isfinite(mine[i])]
+        found = [self._signature(sight, proposal) for proposal in best]
+        found += [found[0]] * (settings.shortlist - len(found))
+        again = rate(jax.tree.map(lambda *x: jnp.stack(x), *found))[: len(best)]
+        mine[best] = again
+        return [best[i] for i in np.argsort(-again, kind="stable")]
 
-    def _value(self, found: PoseEstimate, diameter: float | None) -> float:
-        """What trials of one object are compared by: confidence × score, and how well a known size agrees."""
-        if not bool(found.success):
-            return 0.0
-        value = float(found.confidence) * float(found.hypotheses.score[0])
-        if diameter is None:
-            return value
-        off = np.log(float(found.camera_from_object.scale) / diameter) / self.detection.size_deviation
-        return value * float(np.exp(-0.5 * off**2))
-
-    def _mend(
-        self,
-        sight: Sight,
-        trials: Sequence[_Trial],
-        instances: int,
-        diameter: float | None,
-        seed: int,
-        rejected: list[Rejected],
-    ) -> list[_Trial]:
-        """The best poses that differ, estimated again in the masks that they give."""
-        settings, scene = self.detection, sight.scene
-        mended: list[_Trial] = []
-        chosen: list[PoseEstimate] = []
-        for trial in trials:
-            templates, found = self.estimator.objects[trial.index][0], trial.result.estimate
-            pose = found.camera_from_object
-            if trial.value <= 0:
-                rejected.append(_reject(trial, "no pose was found"))
-            elif len(chosen) >= settings.mended + instances - 1:
-                rejected.append(_reject(trial, "other proposals have surer poses"))
-            elif any(same_instance(templates, one.camera_from_object, pose, settings.same) for one in chosen):
-                rejected.append(_reject(trial, "another proposal led to the same pose, and is surer"))
-            else:
-                chosen.append(found)
-                with sight.watch("mask"):
-                    mask = mask_from_pose(templates, pose, scene.matrix, scene.depth, settings)[0]
-                    crop = cut_crop(scene, mask, **self.options)
-                if crop is None:
-                    rejected.append(_reject(trial, _ELSEWHERE))
-                    continue
-                about = trial.index, trial.proposal, trial.similarity
-                mended.append(self._try(*about, crop, diameter, seed, sight, "verify again"))
-        return mended
-
-    def _claims(self, sight: Sight, trials: Sequence[_Trial], rejected: list[Rejected]) -> list[Claim]:
-        """The pixels of each pose; a pose whose depth is another's claims nothing."""
-        claims = []
-        for trial in trials:
-            templates, info = self.estimator.objects[trial.index]
-            found = trial.result.estimate
-            if trial.value <= 0:
-                rejected.append(_reject(trial, "no pose was found in the mask of its first pose"))
-                continue
-            pose = found.camera_from_object
-            with sight.watch("mask"):
-                mask = mask_from_pose(templates, pose, sight.scene.matrix, sight.scene.depth, self.detection)[0]
-            if not mask.any():
-                rejected.append(_reject(trial, _ELSEWHERE))
-                continue
-            claims.append(Claim(trial.index, info.name, mask, pose, float(found.confidence), trial.value, trial))
-        return claims
-
-
-_ELSEWHERE = "the depth where its pose is belongs to something else"
-
-
-def _detection(claim: Claim) -> Detection:
-    trial: _Trial = claim.source
-    rows, columns = np.flatnonzero(claim.mask.any(1)), np.flatnonzero(claim.mask.any(0))
-    left, top = int(columns[0]), int(rows[0])
-    box = left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
-    near = overlap(trial.proposed, claim.mask)
-    about = trial.result, trial.proposal, trial.similarity, near
-    return Detection(claim.index, claim.name, claim.mask, box, claim.value, *about)
-
-
-def _reject(trial: _Trial, reason: str, mask: np.ndarray | None = None) -> Rejected:
-    return Rejected(
-        trial.index,
-        trial.result.info.name,
-        trial.proposal,
-        trial.similarity,
-        reason,
-        float(trial.result.estimate.confidence),
-        trial.value,
-        trial.crop.mask if mask is None else mask,
-    )
+    def _signature(self, sight: Sight, proposal: int) -> Signature:
+        """Of a whole crop, which is described when it is first wanted."""
+        crop = sight.crops[proposal]
+        assert crop is not None
+        if crop.signature is None:
+            patches = describe_crop(self.estimator, crop, sight.watch)
+            crop.signature = _crop_signature(patches, crop.view)
+        return crop.signature
 
 
 _BUCKET = 64
 _template_signatures = jax.jit(template_signatures)
+_crop_signature = jax.jit(crop_signature)
 _similarity = jax.jit(similarity, static_argnums=2)
 
 

@@ -1,0 +1,195 @@
+"""Proposals verified: an object estimated in each, and once more in the mask that its pose gives."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import jax
+import numpy as np
+from jaxtyping import Bool
+
+from ipjax.config import DetectConfig
+from ipjax.detection.assignment import Claim, overlap, same_instance
+from ipjax.detection.crops import Crop, Scene, cut_crop
+from ipjax.detection.masks import mask_from_pose
+from ipjax.detection.records import Detection, Rejected
+from ipjax.detection.stopwatch import Stopwatch
+from ipjax.estimation.features import describe
+from ipjax.inference.estimator import Estimator, Result
+from ipjax.records import Patches, PoseEstimate
+
+ELSEWHERE = "the depth where its pose is belongs to something else"
+BESIDE = 3  # pixels beside a pose's outline that are not left to another instance
+LEAST_REST = 150  # pixels of a proposal that its pose must leave for another instance to be sought there
+REST_SHARE = 0.25  # and that share of the pose's own outline
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A part of a frame that may be an object."""
+
+    index: int  # of the object
+    proposal: int  # its number
+    similarity: float
+    mask: Bool[np.ndarray, "h w"]  # of the proposal, or of what an instance left of it
+    crop: Crop
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """A candidate that was estimated."""
+
+    candidate: Candidate
+    result: Result
+    value: float  # confidence × score, and how well a known size agrees
+
+
+@dataclasses.dataclass
+class Verifier:
+    """Estimates one object's candidates in a frame, and collects what is given up."""
+
+    estimator: Estimator
+    settings: DetectConfig
+    options: dict[str, Any]  # of `cut_crop`
+    scene: Scene
+    watch: Stopwatch
+    diameter: float | None = None
+    seed: int = 0
+    rejected: list[Rejected] = dataclasses.field(default_factory=list)
+
+    def verify(self, candidates: Sequence[Candidate], instances: int) -> list[Claim]:
+        """The poses of candidates, the pixels that they claim; what does not differ is estimated once.
+
+        Where more than one instance is wanted, what a pose leaves of its proposal may be another: two that touch are
+        often one proposal.
+        """
+        trials = [self._try(one, "verify") for one in candidates]
+        chosen: list[PoseEstimate] = []
+        mended = self._mend(trials, chosen, self.settings.mended + instances - 1)
+        found = list(mended)
+        while mended and instances > 1 and len(found) < self.settings.mended + 2 * instances:
+            rests = [rest for trial in mended if (rest := self._rest(trial)) is not None]
+            mended = self._mend([self._try(one, "verify rest") for one in rests], chosen, len(chosen) + instances)
+            found += mended
+        return self._claims(found)
+
+    def _try(self, candidate: Candidate, stage: str) -> Trial:
+        crop = candidate.crop
+        patches = describe_crop(self.estimator, crop, self.watch)
+        about = crop.view, crop.camera_from_crop
+        with self.watch(stage):
+            result = self.estimator.run(candidate.index, *about, seed=self.seed, patches=patches)
+        self.watch.move("compile", result.seconds.get("compile", 0.0), stage)
+        return Trial(candidate, result, self._value(result.estimate))
+
+    def _value(self, found: PoseEstimate) -> float:
+        """What trials are compared by: confidence × score, and how well a known size agrees."""
+        if not bool(found.success):
+            return 0.0
+        value = float(found.confidence) * float(found.hypotheses.score[0])
+        if self.diameter is None:
+            return value
+        off = np.log(float(found.camera_from_object.scale) / self.diameter) / self.settings.size_deviation
+        return value * float(np.exp(-0.5 * off**2))
+
+    def _mend(self, trials: Sequence[Trial], chosen: list[PoseEstimate], most: int) -> list[Trial]:
+        """The best poses that differ, estimated again in the masks that they give; ``chosen`` has them, too."""
+        mended: list[Trial] = []
+        for trial in sorted(trials, key=lambda one: -one.value):
+            found = trial.result.estimate
+            templates, pose = trial.result.templates, found.camera_from_object
+            apart = self.settings.same
+            if trial.value <= 0:
+                self._reject(trial, "no pose was found")
+            elif len(chosen) >= most:
+                self._reject(trial, "other proposals have surer poses")
+            elif any(same_instance(templates, one.camera_from_object, pose, apart) for one in chosen):
+                self._reject(trial, "another proposal led to the same pose, and is surer")
+            else:
+                chosen.append(found)
+                with self.watch("mask"):
+                    mask = mask_from_pose(templates, pose, self.scene.matrix, self.scene.depth, self.settings)[0]
+                    crop = cut_crop(self.scene, mask, **self.options)
+                if crop is None:
+                    self._reject(trial, ELSEWHERE)
+                else:
+                    again = dataclasses.replace(trial.candidate, crop=crop)
+                    mended.append(self._try(again, "verify again"))
+        return mended
+
+    def _rest(self, trial: Trial) -> Candidate | None:
+        """The largest piece of a proposal that its pose leaves; None where that is too little for another instance."""
+        found = trial.result.estimate
+        if trial.value <= 0:
+            return None
+        about = trial.result.templates, found.camera_from_object, self.scene.matrix, self.scene.depth
+        with self.watch("mask"):
+            whole = mask_from_pose(*about, self.settings)[1]
+            side = 2 * BESIDE + 1
+            grown = cv2.dilate(whole.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
+            left = (trial.candidate.mask & ~grown).astype(np.uint8)
+            _, labels, stats, _ = cv2.connectedComponentsWithStats(left, connectivity=4)
+            if len(stats) < 2:
+                return None
+            largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+            if stats[largest, cv2.CC_STAT_AREA] < max(LEAST_REST, REST_SHARE * whole.sum()):
+                return None
+            mask = labels == largest
+            crop = cut_crop(self.scene, mask, **self.options)
+        return None if crop is None else dataclasses.replace(trial.candidate, mask=mask, crop=crop)
+
+    def _claims(self, trials: Sequence[Trial]) -> list[Claim]:
+        """The pixels of each pose; a pose whose depth is another's claims nothing."""
+        claims = []
+        for trial in trials:
+            found, info = trial.result.estimate, trial.result.info
+            if trial.value <= 0:
+                self._reject(trial, "no pose was found in the mask of its first pose")
+                continue
+            about = trial.result.templates, found.camera_from_object, self.scene.matrix, self.scene.depth
+            with self.watch("mask"):
+                mask = mask_from_pose(*about, self.settings)[0]
+            if not mask.any():
+                self._reject(trial, ELSEWHERE)
+                continue
+            known = found.camera_from_object, float(found.confidence), trial.value, trial
+            claims.append(Claim(trial.candidate.index, info.name, mask, *known))
+        return claims
+
+    def _reject(self, trial: Trial, reason: str) -> None:
+        self.rejected.append(reject(trial, reason))
+
+
+def describe_crop(estimator: Estimator, crop: Crop, watch: Stopwatch) -> Patches:
+    """The patches of a crop, which is described when it is first wanted."""
+    if crop.patches is None:
+        with watch("describe"):
+            run = estimator.compiled("describe", describe, watch.spent, estimator.encoder, crop.view)
+            crop.patches = jax.block_until_ready(run(estimator.encoder, crop.view))
+    return crop.patches
+
+
+def as_detection(claim: Claim) -> Detection:
+    """A claim that holds."""
+    trial: Trial = claim.source
+    rows, columns = np.flatnonzero(claim.mask.any(1)), np.flatnonzero(claim.mask.any(0))
+    left, top = int(columns[0]), int(rows[0])
+    box = left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
+    about = trial.candidate.proposal, trial.candidate.similarity, overlap(trial.candidate.mask, claim.mask)
+    return Detection(claim.index, claim.name, claim.mask, box, claim.value, trial.result, *about)
+
+
+def reject(trial: Trial, reason: str, mask: Bool[np.ndarray, "h w"] | None = None) -> Rejected:
+    """A trial that was given up, for this reason."""
+    candidate = trial.candidate
+    return Rejected(
+        candidate.index,
+        trial.result.info.name,
+        candidate.proposal,
+        candidate.similarity,
+        reason,
+        float(trial.result.estimate.confidence),
+        trial.value,
+        candidate.crop.mask if mask is None else mask,
+    )
