@@ -187,7 +187,7 @@ class DetectConfig(eqx.Module):
 
     views: int = _static(128, least=1)  # templates of each object, the farthest apart, that poses are sought with
     zoom: int = _static(2, least=1)  # all proposals are first described at 1 / this of a crop's size
-    shortlist: int = _static(16, least=1)  # proposals that are then described in whole crops and ranked again
+    shortlist: int = _static(8, least=1)  # proposals that are then described in whole crops and ranked again
     alike: int = _static(3, least=1)  # templates whose similarity to a crop is averaged
     colour: float = 0.5  # weight of colours beside whole features and features by cells, which have 1 each
     verified: int = _static(4, least=1)  # proposals whose pose is estimated, of each object; two more for each instance

@@ -162,7 +162,7 @@ class Detector:
         Returns:
             Poses with the pixels that they claim, and what was given up.
         """
-        order = self._rank(sight, index)[: self.detection.verified + 2 * (instances - 1)]
+        order = self._rank(sight, index, self.detection.verified + 2 * (instances - 1))
         candidates = [
             Candidate(index, i, float(sight.similarity[index, i]), sight.proposals.masks[i], crop)
             for i in order
@@ -205,8 +205,8 @@ class Detector:
         found += [found[0]] * (-len(found) % _BUCKET)
         return jax.block_until_ready(jax.tree.map(lambda *x: jnp.stack(x), *found))
 
-    def _rank(self, sight: Sight, index: int) -> list[int]:
-        """The proposals most like an object, the best first: chosen at a glance, ranked by whole crops."""
+    def _rank(self, sight: Sight, index: int, count: int) -> list[int]:
+        """The ``count`` proposals most like an object, the best first: chosen at a glance, ranked by whole crops."""
         if sight.signatures is None:
             return []
         if index not in self._signatures:
@@ -219,12 +219,13 @@ class Detector:
                 return np.asarray(found)
 
         mine[sight.used] = rate(sight.signatures)[: len(sight.used)]
-        best = [int(i) for i in np.argsort(-mine, kind="stable")[: settings.shortlist] if np.isfinite(mine[i])]
+        most = max(settings.shortlist, count)
+        best = [int(i) for i in np.argsort(-mine, kind="stable")[:most] if np.isfinite(mine[i])]
         found = [self._signature(sight, proposal) for proposal in best]
-        found += [found[0]] * (settings.shortlist - len(found))
+        found += [found[0]] * (most - len(found))
         again = rate(jax.tree.map(lambda *x: jnp.stack(x), *found))[: len(best)]
         mine[best] = again
-        return [best[i] for i in np.argsort(-again, kind="stable")]
+        return [best[i] for i in np.argsort(-again, kind="stable")][:count]
 
     def _signature(self, sight: Sight, proposal: int) -> Signature:
         """Of a whole crop, which is described when it is first wanted."""
