@@ -103,8 +103,11 @@ class ResectConfig(eqx.Module):
     scale_gate: tuple[float, float] = (0.45, 2.2)  # around the size that the areas of both outlines tell
     steps: int = _static(10)  # of Gauss and Newton
     drawn: int = _static(12, least=1)  # hypotheses of all views that are drawn; of photos with depth, poses
-    polished: int = _static(4)  # best of them that are refined on what their drawings match
+    polished: int = _static(4)  # best of them that are refined on what their drawings match, and on their colours
     rounds: int = _static(2)  # of it
+    starts: int = _static(4)  # poses beside each from which colours are aligned with the photo's, too
+    away: float = 0.2  # rad (11°): by which they are turned
+    unlike: float = 2.0  # a drawing's score is multiplied by exp(−this · how unlike its contrasts are)
     window: float = 2.0  # patches in which it is
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much
     cover: float = 0.3  # least share of a patch that must be drawn

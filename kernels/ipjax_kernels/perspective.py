@@ -150,7 +150,7 @@ def refine_resection(
         move = -solve_positive(damped, slope)
         length = root(jnp.sum(move[:3] ** 2))
         move = move * jnp.minimum(1, 0.5 / jnp.maximum(length, 1e-6))
-        new_rotation = jnp.matmul(_exponential(move[:3]), rotation, precision="highest")
+        new_rotation = jnp.matmul(exponential(move[:3]), rotation, precision="highest")
         new_translation = translation + move[3:]
         new = evaluate(new_rotation, new_translation)
         better = new[0] < loss
@@ -164,7 +164,7 @@ def refine_resection(
     return Resection(rotation, translation, loss, hessian)
 
 
-def _exponential(turn):
+def exponential(turn):
     """The rotation by |turn| about it (Rodrigues), exact at zero, too."""
     squared = jnp.sum(turn**2)
     small = squared < 1e-8

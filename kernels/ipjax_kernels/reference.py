@@ -91,3 +91,27 @@ def resection_loss(rotation, translation, points, rays, weight, width):
     placed = points @ np.asarray(rotation).T + translation
     squared = np.sum((placed[:, :2] / placed[:, 2:] - rays) ** 2, axis=1) / width**2
     return np.sqrt(np.where(placed[:, 2] > 0, squared / (1 + squared), 1) * weight / np.sum(weight))
+
+
+def direct_loss(rotation, translation, points, picture, facing=0.2):
+    """The loss of ``direct.align_directly`` at a pose, one point after another."""
+    rotation, translation = np.asarray(rotation, np.float64), np.asarray(translation, np.float64)
+    values, colours = np.asarray(picture.values, np.float64), np.asarray(points.colours, np.float64)
+    height, width = values.shape[:2]
+    total = counted = 0.0
+    for k in np.flatnonzero(points.weight):
+        place = rotation @ np.asarray(points.places[k], np.float64) + translation
+        normal = rotation @ np.asarray(points.normals[k], np.float64)
+        if place[2] <= 0 or -(normal @ place) <= facing * np.linalg.norm(place):
+            continue
+        x, y = np.asarray(picture.focal) * place[:2] / place[2] + np.asarray(picture.centre)
+        x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+        column, row = min(int(x), width - 2), min(int(y), height - 2)
+        a, b = x - column, y - row
+        above = values[row, column] * (1 - a) + values[row, column + 1] * a
+        below = values[row + 1, column] * (1 - a) + values[row + 1, column + 1] * a
+        seen = above * (1 - b) + below * b
+        squared = np.sum((seen[: colours.shape[1]] - colours[k]) ** 2)
+        total += points.weight[k] * (squared / (1 + squared) if seen[-1] > 0.99 else 1.0)
+        counted += points.weight[k]
+    return total / counted if counted else 1.0

@@ -17,7 +17,8 @@ ORDER = [
     [f"ipjax.estimation.{s}" for s in ("features", "matching", "alignment", "refinement", "scoring", "confidence")],
     ["ipjax.estimation.scene", "ipjax.estimation.photo.resection"],
     ["ipjax.estimation.photo.drawing"],
-    ["ipjax.estimation.photo.extent"],
+    ["ipjax.estimation.photo.extent", "ipjax.estimation.photo.contrasts"],
+    ["ipjax.estimation.photo.polishing"],
     ["ipjax.estimation.photo.through_photo", "ipjax.estimation.photo.choice"],
     ["ipjax.estimation.pipeline"],
     # What cannot be jitted.

@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ipjax_kernels.perspective import refine_resection
 from ipjax_kernels.positive import root
 from ipjax_kernels.rasterize import splat_colours
 from jax import lax
@@ -21,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from ipjax.cameras import point_map
 from ipjax.config import ResectConfig
 from ipjax.estimation.features import object_features
-from ipjax.estimation.photo.resection import Look, Resections, Sight, grid_normals, rays_of
+from ipjax.estimation.photo.resection import Look, Sight, grid_normals, rays_of
 from ipjax.estimation.scoring import chroma_correlation
 from ipjax.records import Camera, Patches, Query, ReferenceView, Templates
 from ipjax.transforms import rotation_from_vector
@@ -253,57 +252,3 @@ def draw_query(
         weight=weight,
         depth=depth,
     )
-
-
-class Compared(eqx.Module):
-    """The candidates after their drawings were compared with the photo, each with its best drawing."""
-
-    rotation: Float[Array, "*b 3 3"]
-    translation: Float[Array, "*b 3"]
-    score: Float[Array, "*b"]  # by which they are ranked, in [0, 1]; -1 = absent
-    drawing: Drawing
-
-
-def compare_drawings(
-    encoder: Callable[[Float[Array, "h w 3"]], Float[Array, "gh gw c"]],
-    templates: Templates,
-    query: Query,
-    found: Resections,
-    sight: Sight,
-    config: ResectConfig,
-) -> Compared:
-    """Draw every candidate; then refine the ``config.polished`` best on what their drawings match, and draw them again,
-    ``config.rounds`` times. Of each candidate the pose whose drawing scores best remains.
-
-    One loop whose body draws one candidate: the encoder is compiled once.
-    """
-    count = found.support.shape[0]
-    polished = min(config.polished, count)
-    draw = lambda turn, shift: draw_query(encoder, templates, query, turn, shift, sight, config)
-    blank = jax.eval_shape(draw, found.rotation[0], found.translation[0])
-    blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), blank)
-    absent = jnp.full(count, -1, found.support.dtype)
-    # What no pair agrees with and what sticks out of the outline is rarely right, however alike the rest of it looks.
-    agreed = root(root(jnp.clip(found.support, 0, 1)))
-    width = config.width * sight.diagonal
-
-    def step(index, state):
-        turns, shifts, first, best = state
-        order = lax.top_k(first, max(polished, 1))[1]
-        one = jnp.where(index < count, index, order[(index - count) % max(polished, 1)])
-        drawn = draw(turns[one], shifts[one])
-        score = drawn.overlap * root(drawn.contained) * agreed[one]
-        score = jnp.where(found.support[one] >= 0, score, -1)
-        first = first.at[one].set(jnp.where(index < count, score, first[one]))
-        here = Compared(turns[one], shifts[one], score, drawn)
-        better = score > best.score[one]
-        best = jax.tree.map(
-            lambda all_of_them, new: all_of_them.at[one].set(jnp.where(better, new, all_of_them[one])), best, here
-        )
-        fit = refine_resection(
-            turns[one], shifts[one], drawn.points, drawn.rays, drawn.weight, width, steps=config.steps
-        )
-        return turns.at[one].set(fit.rotation), shifts.at[one].set(fit.translation), first, best
-
-    start = found.rotation, found.translation, absent, Compared(found.rotation, found.translation, absent, blank)
-    return lax.fori_loop(0, count + polished * config.rounds, step, start)[3]

@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from ipjax.config import Config
 from ipjax.estimation.confidence import find_rival, probability, rotation_ambiguity
 from ipjax.estimation.features import object_features
-from ipjax.estimation.photo.drawing import compare_drawings, look_from_beside, splat_query
+from ipjax.estimation.photo.drawing import look_from_beside, splat_query
 from ipjax.estimation.photo.extent import centre_std, measure_extent
+from ipjax.estimation.photo.polishing import compare_drawings
 from ipjax.estimation.photo.resection import (
     Look,
     match_photo,
