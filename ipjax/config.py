@@ -151,7 +151,7 @@ class Config(eqx.Module):
         return Config(
             match=MatchConfig(views=6),
             refine=RefineConfig(steps=8, settle=False),
-            resect=ResectConfig(beside=4, views=8, count=512, drawn=4, polished=1),
+            resect=ResectConfig(beside=4, views=8, count=512, drawn=4, polished=1, rounds=1),
             score=ScoreConfig(alternates=0, drawn=3),
         )
 
