@@ -107,6 +107,7 @@ class ResectConfig(eqx.Module):
     rounds: int = _static(2)  # of it
     starts: int = _static(4)  # poses beside each from which colours are aligned with the photo's, too
     away: float = 0.2  # rad (11°): by which they are turned
+    patches: float = 0.1  # weight of what patches matched while colours are aligned
     unlike: float = 2.0  # a drawing's score is multiplied by exp(−this · how unlike its contrasts are)
     window: float = 2.0  # patches in which it is
     softness: float = 0.05  # cosine by which a patch nearby must be less alike to count 1/e as much

@@ -97,5 +97,6 @@ def undistort_mask(mask: np.ndarray, camera: Any) -> np.ndarray:
     if not intrinsics.distortion:
         return mask
     depth = np.zeros(mask.shape, np.float32)
-    _, _, mask, _ = undistort_frame(np.zeros((*mask.shape, 3), np.uint8), depth, mask, None, intrinsics)
-    return mask
+    _, _, plain, _ = undistort_frame(np.zeros((*mask.shape, 3), np.uint8), depth, mask, None, intrinsics)
+    assert plain is not None  # a mask was given
+    return plain

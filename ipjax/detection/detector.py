@@ -233,7 +233,8 @@ class Detector:
         assert crop is not None
         if crop.signature is None:
             patches = describe_crop(self.estimator, crop, sight.watch)
-            crop.signature = _crop_signature(patches, crop.view)
+            signature = crop.signature = _crop_signature(patches, crop.view)
+            return signature
         return crop.signature
 
 

@@ -163,11 +163,13 @@ class Verifier:
 
 def describe_crop(estimator: Estimator, crop: Crop, watch: Stopwatch) -> Patches:
     """The patches of a crop, which is described when it is first wanted."""
-    if crop.patches is None:
-        with watch("describe"):
-            run = estimator.compiled("describe", describe, watch.spent, estimator.encoder, crop.view)
-            crop.patches = jax.block_until_ready(run(estimator.encoder, crop.view))
-    return crop.patches
+    if crop.patches is not None:
+        return crop.patches
+    with watch("describe"):
+        run = estimator.compiled("describe", describe, watch.spent, estimator.encoder, crop.view)
+        patches: Patches = jax.block_until_ready(run(estimator.encoder, crop.view))
+    crop.patches = patches
+    return patches
 
 
 def as_detection(claim: Claim) -> Detection:

@@ -34,6 +34,14 @@ class Points(NamedTuple):
     weight: Float[Array, "k"]  # 0 = absent
 
 
+class Prior(NamedTuple):
+    """Where a camera is by other evidence: a pose, and how fast the loss grows away from it."""
+
+    rotation: Float[Array, "3 3"]
+    translation: Float[Array, "3"]
+    information: Float[Array, "6 6"]  # of (turn about the points' centre, shift): the loss grows by ½ δᵀ information δ
+
+
 class Alignment(NamedTuple):
     """The pose of a camera, and how unlike the image the points look."""
 
@@ -58,6 +66,7 @@ def align_directly(
     translation: Float[Array, "3"],
     points: Points,
     picture: Picture,
+    prior: Prior | None = None,
     *,
     steps: int = 5,
     facing: float = 0.2,
@@ -70,6 +79,8 @@ def align_directly(
 
     Args:
       rotation, translation: the start, camera from points.
+      prior: added to the loss that is lowered, not to the one that is returned. Where the image has no texture, it
+        alone decides.
       facing: the least cosine between a point's normal and the direction to the camera, with which it counts.
     """
     share = points.weight / jnp.maximum(jnp.sum(points.weight), 1e-12)
@@ -111,10 +122,19 @@ def align_directly(
         slopes = jnp.where(inside[:, None, None], slopes, 0)
         hessian = jnp.einsum("kca,kcb,k->ab", slopes, slopes, each, precision="highest")
         slope = jnp.einsum("kca,kc,k->a", slopes, offset, each, precision="highest")
-        return jnp.where(jnp.any(counted > 0), loss, 1), hessian, slope
+        loss = jnp.where(jnp.any(counted > 0), loss, 1)
+        if prior is None:
+            return loss, loss, hessian, slope
+        # The axis of a small turn, exact to its third order.
+        turn = jnp.matmul(rotation, prior.rotation.T, precision="highest")
+        axis = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+        expected = prior.translation + jnp.sum(prior.rotation * middle[None], axis=1)
+        away = jnp.concatenate([axis, translation - expected])
+        pull = jnp.sum(prior.information * away[None], axis=1)
+        return loss + jnp.sum(pull * away) / 2, loss, hessian + prior.information / 2, slope + pull / 2
 
     def step(state, _):
-        rotation, translation, (loss, hessian, slope), damping = state
+        rotation, translation, (total, loss, hessian, slope), damping = state
         diagonal = jnp.diagonal(hessian)
         largest = jnp.max(diagonal)
         floor = jnp.where(largest > 1e-12, 1e-9 * largest, 1)
@@ -124,13 +144,13 @@ def align_directly(
         new_rotation = jnp.matmul(exponential(move[:3]), rotation, precision="highest")
         new_translation = translation + move[3:]
         new = evaluate(new_rotation, new_translation)
-        better = new[0] < loss
+        better = new[0] < total
         choose = lambda fresh, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), fresh, old)
-        state = choose((new_rotation, new_translation, new), (rotation, translation, (loss, hessian, slope)))
+        state = choose((new_rotation, new_translation, new), (rotation, translation, (total, loss, hessian, slope)))
         return (*state, jnp.clip(jnp.where(better, damping / 4, damping * 5), 1e-5, 1e5)), None
 
     start = rotation, translation, evaluate(rotation, translation), jnp.asarray(1e-2, translation.dtype)
-    (rotation, translation, (loss, _, _), _), _ = lax.scan(step, start, None, length=steps)
+    (rotation, translation, (_, loss, _, _), _), _ = lax.scan(step, start, None, length=steps)
     return Alignment(rotation, translation - jnp.sum(rotation * middle[None], axis=1), loss)
 
 

@@ -1,10 +1,10 @@
-"""Direct alignment: the loss is the slow twin's, made poses come back without bias, and nothing to see moves nothing."""
+"""Direct alignment: the loss is the slow twin's, poses come back without bias, and nothing to see moves nothing."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ipjax_kernels.direct import Points, align_directly, make_picture
+from ipjax_kernels.direct import Points, Prior, align_directly, make_picture
 from ipjax_kernels.reference import direct_loss
 from scipy.spatial.transform import Rotation
 
@@ -76,6 +76,22 @@ def test_a_pose_some_degrees_off_comes_back_without_bias():
     assert np.median(aside) < 0.3 and aside.max() < 2
     assert np.abs(shifts[:, 2]).max() < 5
     assert np.abs(shifts.mean(axis=0)).max() < 0.5
+
+
+def test_where_nothing_has_texture_the_prior_decides_and_texture_outweighs_a_weak_one():
+    points, picture, rotation, translation = scene(2)
+    start, shift = jnp.asarray(turned(rotation, 2, 5.0), jnp.float32), jnp.asarray(translation, jnp.float32)
+    expected = jnp.asarray(turned(rotation, 2, 2.0), jnp.float32)
+    off = lambda found, to: Rotation.from_matrix(np.asarray(found.rotation, np.float64) @ np.asarray(to).T).magnitude()
+    plain = points._replace(colours=0 * points.colours), picture._replace(values=picture.values.at[..., :9].set(0))
+    strong = Prior(expected, shift, jnp.diag(jnp.array([10.0, 10, 10, 1e3, 1e3, 1e3])))
+    assert np.degrees(off(align(start, shift, *plain, strong, steps=20), expected)) < 0.1
+    weak = strong._replace(information=1e-3 * strong.information)
+    found = align(start, shift, points, picture, weak, steps=20)
+    assert np.degrees(off(found, rotation)) < 0.5
+    # The loss that is told is that of the image alone.
+    alone = align(found.rotation, found.translation, points, picture, steps=0)
+    np.testing.assert_allclose(float(found.loss), float(alone.loss), atol=1e-3)
 
 
 @pytest.mark.parametrize("fault", ["no points", "no normals", "no image", "one colour", "behind"])

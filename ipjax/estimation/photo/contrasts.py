@@ -8,7 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ipjax_kernels.direct import Alignment, Picture, Points, align_directly, make_picture
+from ipjax_kernels.direct import Alignment, Picture, Points, Prior, align_directly, make_picture
+from ipjax_kernels.perspective import Resection
 from ipjax_kernels.positive import root
 from jaxtyping import Array, Bool, Float
 
@@ -22,6 +23,7 @@ from ipjax.transforms import rotation_from_vector
 STRIDE = 4  # pixels of the query between the points that are compared
 BLURS = (0.0134, 0.0067)  # standard deviations, of the image's side: from coarse to fine
 AROUND = 3.0  # of the surroundings, relative to them
+CLEARLY = 0.9  # share of the loss below which a pose is clearly more alike
 CONTRAST = 0.02  # colours that vary less than this tell little
 
 
@@ -61,6 +63,7 @@ def align_drawn(
     query: Query,
     rotation: Float[Array, "3 3"],
     translation: Float[Array, "3"],
+    prior: Prior,
     sight: Sight,
     config: ResectConfig,
 ) -> Alignment:
@@ -71,6 +74,7 @@ def align_drawn(
 
     Args:
       rotation, translation: the photo's camera from the query's, metres; within a few degrees.
+      prior: of `expect`.
     """
     image, depth = splat_query(reference, query, rotation, translation, sight)
     photo, lens = reference.view, reference.view.camera
@@ -81,7 +85,7 @@ def align_drawn(
     picture = make_picture(contrast(photo.rgb, both, BLURS[0]), both, lens.focal, lens.centre)
     drawn = contrast(image[..., :3], both, BLURS[0])
     points = Points(_thin(places), _thin(normals), _thin(drawn), _thin(both).astype(depth.dtype))
-    return align_directly(rotation, translation, points, picture, steps=config.steps // 2)
+    return align_directly(rotation, translation, points, picture, prior, steps=config.steps // 2)
 
 
 def _thin(image: Array) -> Array:
@@ -116,17 +120,45 @@ def _blur(image: Float[Array, "h w c"], deviation: float) -> Float[Array, "h w c
     return jnp.einsum("ij,jkc,lk->ilc", rows, image, columns, precision="highest")
 
 
-def align_colours(
-    comparison: Comparison, rotation: Float[Array, "3 3"], translation: Float[Array, "3"], config: ResectConfig
-) -> Alignment:
-    """The photo's camera moved until the query's colours look like the photo, from the start and from beside it.
+def expect(
+    comparison: Comparison,
+    fit: Resection,
+    points: Float[Array, "p 3"],
+    weight: Float[Array, "p"],
+    config: ResectConfig,
+) -> Prior:
+    """What a fit of patches tells the alignment of colours: where nothing has texture, patches decide.
 
     Args:
-      rotation, translation: the photo's camera from the query's, metres.
+      points, weight: that were fitted.
+    """
+    total = jnp.sum(weight)
+    centre = jnp.sum(weight[:, None] * points, axis=0) / jnp.where(total > 1e-12, total, 1)
+    # A turn about the comparison's middle shifts the centre of what was fitted, too.
+    x, y, z = jnp.matmul(fit.rotation, centre - comparison.middle, precision="highest")
+    zero = jnp.zeros_like(x)
+    lever = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
+    moved = jnp.eye(6, dtype=lever.dtype).at[3:, :3].set(lever)
+    # Of Gauss and Newton's loss, which grows by δᵀ information δ.
+    information = (
+        2
+        * config.patches
+        * jnp.matmul(jnp.matmul(moved.T, fit.information, precision="highest"), moved, precision="highest")
+    )
+    return Prior(fit.rotation, fit.translation, information)
+
+
+def align_colours(comparison: Comparison, prior: Prior, config: ResectConfig) -> Alignment:
+    """The photo's camera moved until the query's colours look like the photo, from where it is expected and beside.
+
+    Args:
+      prior: of `expect`.
 
     Returns:
-      The most alike of ``1 + config.starts``; those beside are turned by ``config.away`` about the points' middle.
+      The most alike of ``1 + config.starts``; those beside are turned by ``config.away`` about the points' middle, and
+      must be clearly more alike: between two that are equal, the nearer is the likelier.
     """
+    rotation, translation = prior.rotation, prior.translation
     dtype = translation.dtype
     angle = 2 * jnp.pi * jnp.arange(config.starts, dtype=dtype) / max(config.starts, 1)
     beside = config.away * jnp.stack([jnp.cos(angle), jnp.sin(angle), 0 * angle], axis=-1)
@@ -137,9 +169,9 @@ def align_colours(
         shift = translation + jnp.matmul(rotation - turned, comparison.middle, precision="highest")
         found = Alignment(turned, shift, jnp.ones((), dtype))
         for points, picture in zip(comparison.query, comparison.photo, strict=True):
-            found = align_directly(found.rotation, found.translation, points, picture, steps=config.steps // 2)
+            found = align_directly(found.rotation, found.translation, points, picture, prior, steps=config.steps // 2)
         return found
 
     found = jax.vmap(align)(beside)
-    best = jnp.argmin(found.loss)
+    best = jnp.argmin(found.loss * jnp.where(jnp.arange(beside.shape[0]) > 0, 1 / CLEARLY, 1))
     return jax.tree.map(lambda x: x[best], found)

@@ -1,17 +1,18 @@
-"""Candidates drawn, compared with the photo, and moved until they look like it: by their patches, then by their colours."""
+"""Candidates drawn, compared with the photo, and moved until they look like it: by patches, then by colours."""
 
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from ipjax_kernels.direct import Prior
 from ipjax_kernels.perspective import refine_resection
 from ipjax_kernels.positive import root
 from jax import lax
 from jaxtyping import Array, Float
 
 from ipjax.config import ResectConfig
-from ipjax.estimation.photo.contrasts import align_colours, align_drawn, prepare_comparison, unlikeness
+from ipjax.estimation.photo.contrasts import align_colours, align_drawn, expect, prepare_comparison, unlikeness
 from ipjax.estimation.photo.drawing import Drawing, draw_query
 from ipjax.estimation.photo.resection import Resections, Sight
 from ipjax.records import Query, Templates
@@ -54,16 +55,17 @@ def compare_drawings(
     width = config.width * sight.diagonal
     comparison = prepare_comparison(reference, query)
 
-    def polish(turn, shift):
-        wide = align_colours(comparison, turn, shift, config)
-        close = align_drawn(reference, query, wide.rotation, wide.translation, sight, config)
+    def polish(prior):
+        wide = align_colours(comparison, prior, config)
+        close = align_drawn(reference, query, wide.rotation, wide.translation, prior, sight, config)
         return close.rotation, close.translation
 
     def step(index, state):
-        turns, shifts, first, best = state
+        priors, first, best = state
         order = lax.top_k(first, max(polished, 1))[1]
         one = jnp.where(index < count, index, order[(index - count) % max(polished, 1)])
-        turn, shift = lax.cond(index < count, lambda *pose: pose, polish, turns[one], shifts[one])
+        prior = jax.tree.map(lambda x: x[one], priors)
+        turn, shift = lax.cond(index < count, lambda one: (one.rotation, one.translation), polish, prior)
         drawn = draw(turn, shift)
         unlike = unlikeness(comparison, turn, shift)
         score = drawn.overlap * root(drawn.contained) * agreed[one] * jnp.exp(-config.unlike * unlike)
@@ -75,7 +77,10 @@ def compare_drawings(
             lambda all_of_them, new: all_of_them.at[one].set(jnp.where(better, new, all_of_them[one])), best, here
         )
         fit = refine_resection(turn, shift, drawn.points, drawn.rays, drawn.weight, width, steps=config.steps)
-        return turns.at[one].set(fit.rotation), shifts.at[one].set(fit.translation), first, best
+        prior = expect(comparison, fit, drawn.points, drawn.weight, config)
+        return jax.tree.map(lambda all_of_them, new: all_of_them.at[one].set(new), priors, prior), first, best
 
-    start = found.rotation, found.translation, absent, Compared(found.rotation, found.translation, absent, blank)
-    return lax.fori_loop(0, count + polished * config.rounds, step, start)[3]
+    nothing = jnp.zeros((count, 6, 6), found.translation.dtype)
+    start = Prior(found.rotation, found.translation, nothing), absent
+    best = Compared(found.rotation, found.translation, absent, blank)
+    return lax.fori_loop(0, count + polished * config.rounds, step, (*start, best))[2]

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders.photo_pairs import PhotoPair, make_photo_pair
+from ipjax_kernels.direct import Prior
 from scipy.spatial.transform import Rotation
 
 from ipjax.cameras import point_map
@@ -61,9 +62,10 @@ def painted(pair: PhotoPair, seed: int) -> PhotoPair:
 @pytest.fixture(scope="module")
 def align():
     def run(reference, query, turn, shift):
-        wide = align_colours(prepare_comparison(reference, query), turn, shift, CONFIG)
+        anywhere = Prior(turn, shift, jnp.zeros((6, 6)))
+        wide = align_colours(prepare_comparison(reference, query), anywhere, CONFIG)
         sight = measure_sight(reference, query)
-        return wide, align_drawn(reference, query, wide.rotation, wide.translation, sight, CONFIG)
+        return wide, align_drawn(reference, query, wide.rotation, wide.translation, anywhere, sight, CONFIG)
 
     return jax.jit(run)
 
