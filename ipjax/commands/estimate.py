@@ -285,7 +285,7 @@ def _estimate_frame(
     detection = None
     if is_without_masks(files):
         found, detection = detect_frame(files.name, images, detector, estimator, diameters, arguments, messages)
-        entries = [_entry(one, arguments) | {"mask": None, "detected": one.about} for one in found]
+        entries = [_entry(one, infos, arguments) | {"mask": None, "detected": one.about} for one in found]
     else:
         found, entries = _estimate_masks(files, images, estimator, diameters, arguments, messages)
     results = [one.result for one in found if one.result is not None]
@@ -315,13 +315,13 @@ def _estimate_frame(
     return entry
 
 
-def _entry(found: Found, arguments: argparse.Namespace) -> dict[str, Any]:
+def _entry(found: Found, infos: list[Any], arguments: argparse.Namespace) -> dict[str, Any]:
     """What is told of one object in one frame."""
     from ipjax.inference.reports import estimate_as_json, nothing_as_json
 
     path, result = arguments.objects[found.index], found.result
     if result is None:
-        return {"object_file": str(path), **nothing_as_json(path.stem)}
+        return {"object_file": str(path), **nothing_as_json(infos[found.index].name)}
     return {
         "object_file": str(path),
         **estimate_as_json(result.estimate, result.templates, result.info),
@@ -339,6 +339,7 @@ def _estimate_masks(
     messages: Messages,
 ) -> tuple[list[Found], list[dict[str, Any]]]:
     """Estimate each object in the mask, box or masks that were given for it; and what is told of each."""
+    infos = [info for _, info in estimator.objects]
     crops = []
     for i, (candidates, box) in enumerate(zip(images.candidates, files.boxes, strict=True)):
         # Several masks are cut out one after the other, as each is estimated.
@@ -351,7 +352,7 @@ def _estimate_masks(
         crops.append((crop, time.perf_counter() - start))
     found, entries = [], []
     for i, cut in enumerate(crops):
-        info = estimator.objects[i][1]
+        info = infos[i]
         options: dict[str, Any] = {"seed": arguments.seed, "diameter": diameters[i]}
         start, tried = time.perf_counter(), None
         masks = images.candidates[i]
@@ -369,7 +370,8 @@ def _estimate_masks(
             about = files.name, images, estimator, i, result, masks[chosen].mask, messages, arguments.depth_scale
             result, mended, mask = mend_mask(*about, **options)
         found.append(Found(i, result, mask, seconds, diameters[i], None))
-        entries.append({"mask": None if files.masks[i] is None else str(files.masks[i])} | _entry(found[-1], arguments))
+        path = None if files.masks[i] is None else str(files.masks[i])
+        entries.append({"mask": path} | _entry(found[-1], infos, arguments))
         if mended is not None:
             entries[-1]["mended_mask"] = mended
         if tried is not None:

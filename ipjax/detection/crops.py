@@ -10,7 +10,7 @@ from ipjax.files.cameras.reading import as_intrinsics
 from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import remove_sentinel
 from ipjax.inference.cutting import undistort_frame
-from ipjax.inference.depth import find_depth_scale, to_metres
+from ipjax.inference.depth import check_frame_unit, find_depth_scale, to_metres
 from ipjax.inference.frames import cut_object
 from ipjax.records import Patches, Similarity, View
 
@@ -39,7 +39,7 @@ def read_scene(rgb: Any, depth: Any, camera: Any, depth_scale: float | None = No
     """Check a frame as `ipjax.frame` does, and undistort it.
 
     Raises:
-        ValueError: sizes differ, the unit of the depth is not known, or there is no depth; in words.
+        ValueError: sizes differ, the unit of the depth is not known or cannot be right, or there is no depth; in words.
     """
     intrinsics = as_intrinsics(camera)
     rgb = as_native(np.asarray(rgb))
@@ -57,6 +57,8 @@ def read_scene(rgb: Any, depth: Any, camera: Any, depth_scale: float | None = No
         raise ValueError(f"rgb must be uint8, uint16 or float in [0, 1], not {rgb.dtype}")
     rgb = np.ascontiguousarray(rgb)
     height, width = rgb.shape[:2]
+    if depth is None:
+        raise ValueError("there is no depth image: objects are sought, and masks are mended, by depth")
     depth = as_native(np.asarray(np.ma.filled(depth, 0)))
     depth = depth[..., 0] if depth.ndim == 3 and depth.shape[-1] == 1 else depth
     if depth.shape != (height, width):
@@ -68,10 +70,12 @@ def read_scene(rgb: Any, depth: Any, camera: Any, depth_scale: float | None = No
             f"the camera is for images of {intrinsics.size[0]} × {intrinsics.size[1]}, but rgb is {width} × {height}"
         )
     depth, _ = remove_sentinel(depth)
-    metres = to_metres(depth, find_depth_scale(depth, depth_scale, intrinsics))
+    scale = find_depth_scale(depth, depth_scale, intrinsics)
+    check_frame_unit(depth, scale)
+    metres = to_metres(depth, scale)
     metres = np.where(np.isfinite(metres) & (metres > 0), metres, 0).astype(np.float32)
     if not metres.any():
-        raise ValueError("the depth image is empty: without depth an object needs a mask or a box")
+        raise ValueError("the depth image is empty: objects are sought, and masks are mended, by depth")
     if intrinsics.distortion:
         rgb, metres, _, _ = undistort_frame(rgb, metres, None, None, intrinsics)
     return Scene(rgb, metres, np.asarray(intrinsics.matrix, np.float64))

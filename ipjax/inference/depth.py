@@ -7,6 +7,7 @@ from jaxtyping import Float
 from ipjax.files.cameras.intrinsics import Intrinsics, check_depth_scale
 
 _NEAREST, _FARTHEST = 0.01, 30.0  # metres; a median depth outside is taken for a wrong unit
+_HARDLY = 0.01  # share of a whole frame's depth between both, below which its unit is wrong: walls may be farther
 
 
 def clean_depth(depth: np.ndarray, edge_tolerance: float = 0.02) -> np.ndarray:
@@ -111,6 +112,20 @@ def check_depth_unit(depth: np.ndarray, mask: np.ndarray, bounds: tuple[int, int
     if not _NEAREST <= median <= _FARTHEST:
         raise ValueError(_unit_in_words(raw, f"with depth_scale={scale:g} the object is {median:.3g} m away", scale))
     return median
+
+
+def check_frame_unit(depth: np.ndarray, scale: float) -> None:
+    """Refuse the depth of a whole frame in which hardly anything is where objects can be: its unit is wrong.
+
+    Raises ValueError with the unit that the values suggest.
+    """
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    metres = known * np.float64(scale)
+    if known.size and np.mean((metres >= _NEAREST) & (metres <= _FARTHEST)) < _HARDLY:
+        raw = float(np.median(known))
+        raise ValueError(
+            _unit_in_words(raw, f"with depth_scale={scale:g} the scene is {raw * scale:.3g} m away", scale)
+        )
 
 
 def to_metres(depth: np.ndarray, scale: float) -> np.ndarray:

@@ -86,9 +86,47 @@ def test_a_rough_mask_is_mended_and_it_is_said(scene, capfd):
         (("--mask-is-rough",), "needs a --mask"),
         (("--mask", "rgb.png", "--instances", "2"), "for objects that are sought"),
         (("--depth-scale", "-1"), "positive"),
+        (("--depth-scale", "1000"), "pass depth_scale=1"),
+        (("--obj-id", "5"), "--obj-id says which of several masks: it needs a --mask"),
     ],
 )
 def test_what_cannot_be_is_refused(scene, capfd, more, words):
     _, given, _ = scene
     assert run([*given, *more]) == 2
     assert words in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("masks", "more", "words"),
+    [
+        (False, ("--mask-is-rough",), "no masks in mask/"),
+        (True, ("--instances", "all"), "is for objects that are sought, but"),
+    ],
+)
+def test_options_that_a_folder_of_frames_cannot_follow_are_refused(scene, capfd, masks, more, words):
+    folder, (_, mug, *_), frame = scene
+    for name in ("rgb", "depth", *(("mask",) if masks else ())):
+        (folder / name).mkdir()
+    Image.fromarray(frame.rgb).save(folder / "rgb" / "a.png")
+    assert run(["estimate", mug, "--frames", str(folder), *more]) == 2
+    assert words in capfd.readouterr().err
+
+
+def test_an_object_that_is_nowhere_is_told_by_its_name(scene, capfd):
+    folder, words, frame = scene
+    depth = np.zeros_like(frame.depth)
+    depth[:2, :2] = 1.0  # no proposal has depth
+    np.save(folder / "depth.npy", depth)
+    assert run([*words, "--json"]) == 1
+    out, error = capfd.readouterr()
+    (one,) = json.loads(out)["frames"][0]["objects"]
+    assert one["object"] == "ellipsoid" and not one["success"] and one["detected"] is None
+    assert "no mask was found" in error
+
+
+def test_an_object_whose_mask_has_no_depth_to_trust_is_told_too(scene, capfd, monkeypatch):
+    monkeypatch.setattr("ipjax.detection.crops.cut_crop", lambda *_, **__: None)  # the detector has its own by now
+    _, words, _ = scene
+    assert run([*words, "--json"]) == 1
+    (one,) = json.loads(capfd.readouterr().out)["frames"][0]["objects"]
+    assert one["object"] == "ellipsoid" and not one["success"]

@@ -52,6 +52,10 @@ def test_frames_that_cannot_be_searched_are_refused_in_words():
     frame, sought = make_frame(), detector()
     with pytest.raises(ValueError, match="depth image is empty"):
         sought.detect(frame.rgb, 0 * frame.depth, MATRIX)
+    with pytest.raises(ValueError, match="no depth image"):
+        sought.detect(frame.rgb, None, MATRIX)
+    with pytest.raises(ValueError, match=r"looks like millimetres; pass depth_scale=0\.001"):
+        sought.detect(frame.rgb, 1000 * frame.depth, MATRIX)
     with pytest.raises(ValueError, match="but depth is"):
         sought.detect(frame.rgb, frame.depth[:100], MATRIX)
     with pytest.raises(ValueError, match="at least one instance"):

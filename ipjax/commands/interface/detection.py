@@ -82,6 +82,7 @@ def detect_frame(
     for index, (_, info) in enumerate(estimator.objects):
         mine = [one for one in detections if one.index == index]
         kept = [one for number, one in enumerate(mine) if number == 0 or one.present]
+        estimated = []
         for one in kept:
             start = time.perf_counter()
             crop = cut_crop(detections.scene, one.mask, resolution=info.resolution, crop=arguments.crop)
@@ -90,11 +91,10 @@ def detect_frame(
             seconds = time.perf_counter() - start
             given = {"seed": arguments.seed, "diameter": diameters[index]}
             result = estimator.run(index, crop.view, crop.camera_from_crop, **given)
-            found.append(Found(index, result, one.mask, seconds, diameters[index], _about(one)))
-        if not kept:
-            found.append(Found(index, None, None, 0.0, diameters[index], None))
-    count = len(detections.proposals.masks)
-    many = f"{len(found)} masks were" if len(found) != 1 else "the mask was"
+            estimated.append(Found(index, result, one.mask, seconds, diameters[index], _about(one)))
+        found += estimated or [Found(index, None, None, 0.0, diameters[index], None)]
+    count, hits = len(detections.proposals.masks), sum(one.result is not None for one in found)
+    many = {0: "no mask was", 1: "the mask was"}.get(hits, f"{hits} masks were")
     messages.note(f"{name}: {many} found, not given: {count} proposals, ranked and verified in {spent:.1f} s")
     return found, {
         "proposals": count,

@@ -61,8 +61,11 @@ def list_frames(arguments: argparse.Namespace) -> list[FrameFiles]:
         camera = next((str(folder / name) for name in CAMERAS if (folder / name).is_file()), None)
         if camera is None:
             raise ValueError(f"{folder}: no camera file in it ({', '.join(CAMERAS)}); give --camera")
-    if _mask_folder(folder) is None and (arguments.instance or arguments.obj_id or arguments.mask_label):
+    masks = _mask_folder(folder)
+    if masks is None and (_chosen_mask(arguments) or arguments.mask_is_rough):
         raise ValueError(f"{folder}: no masks in mask/, masks/ or mask_visib/")
+    if masks is not None and arguments.instances != 1:
+        raise ValueError(f"--instances is for objects that are sought, but {folder} has masks in {masks.name}/")
     frames = []
     for path in found:
         depths = [folder / "depth" / f"{path.stem}{suffix}" for suffix in DEPTHS]
@@ -77,6 +80,8 @@ def _single_frame(arguments: argparse.Namespace) -> FrameFiles:
     if missing:
         raise ValueError(f"a frame needs {', '.join(missing)} (or give --frames FOLDER)")
     masks, boxes = arguments.mask or [], arguments.box or []
+    if not masks and (name := _chosen_mask(arguments)):
+        raise ValueError(f"{name} says which of several masks: it needs a --mask")
     if len(masks) not in (0, count) or len(boxes) not in (0, count):
         raise ValueError(
             f"{count} object{'s need as many' if count > 1 else ' needs one'} --mask or --box, in the same order, or "
@@ -90,6 +95,12 @@ def _single_frame(arguments: argparse.Namespace) -> FrameFiles:
         masks or [None] * count,
         boxes or [None] * count,
     )
+
+
+def _chosen_mask(arguments: argparse.Namespace) -> str:
+    """The option that says which of several masks is the object's; "" where none does."""
+    names = ("instance", "obj_id", "mask_label")
+    return next((f"--{name.replace('_', '-')}" for name in names if getattr(arguments, name)), "")
 
 
 def _mask_folder(folder: Path) -> Path | None:
