@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ class DatasetDetector(DatasetEstimator):
         everything: seek all objects in every frame, as many as there are, whatever the targets name.
         folder: gets a file of detections in two dimensions for each image; see `join_detections`.
     """
+
+    seeks = True  # `evaluation.evaluate` reads no masks for it
 
     def __init__(
         self,
@@ -90,16 +92,24 @@ class DatasetDetector(DatasetEstimator):
                 as_detection(frame.scene_id, frame.im_id, self.numbers[one.index], one.score, one.mask, seconds)
                 for one in found
             ]
-            write_detections(self.folder / f"{frame.scene_id:06d}_{frame.im_id:06d}.json", masks)
+            write_detections(_file_of(self.folder, frame.scene_id, frame.im_id), masks)
         missed = {self.numbers[index] for index, count in wanted if count} - {self.numbers[one.index] for one in found}
         for obj_id in sorted(missed) if not self.everything else ():
             self.refused.append(f"scene {frame.scene_id}, image {frame.im_id}, object {obj_id}: not found")
         return [self.as_estimate(self.numbers[one.index], one.result, one.score) for one in found]
 
 
-def join_detections(folder: Path, path: Path) -> Path:
-    """One file of all detections in two dimensions that a `DatasetDetector` wrote into a folder, image by image."""
+def join_detections(folder: Path, path: Path, images: Iterable[tuple[int, int]]) -> Path:
+    """One file of the detections in two dimensions that a `DatasetDetector` wrote into a folder, image by image.
+
+    ``images``: (scene, image) of this run; a folder that was begun anew may have others of before.
+    """
     found: list[Detection] = []
-    for file in sorted(folder.glob("*.json")):
-        found += read_detections(file)
+    for image in sorted(images):
+        file = _file_of(folder, *image)
+        found += read_detections(file) if file.is_file() else []
     return write_detections(path, found)
+
+
+def _file_of(folder: Path, scene_id: int, im_id: int) -> Path:
+    return folder / f"{scene_id:06d}_{im_id:06d}.json"

@@ -11,7 +11,7 @@ from ipjax.bop.alignments import align, describe_alignments
 from ipjax.bop.dataset import Dataset
 from ipjax.bop.detections import Detection, detected_targets, every_target
 from ipjax.bop.journal import Journal, locked_folder
-from ipjax.bop.records import DatasetError, Estimate, Frame, Target, check_rotation
+from ipjax.bop.records import DatasetError, Estimate, Frame, Target, TargetRow, check_rotation
 from ipjax.bop.results import ResultRow, as_row, sized_path, write_results
 from ipjax.bop.scoring.scores import Score, score
 from ipjax.bop.scoring.tables import format_score
@@ -50,7 +50,7 @@ def evaluate(
         estimator: ``(frame, targets) -> estimates`` for the targets of one image; an object may be left out. Seconds
             that it counts in an attribute ``compile_seconds`` are not part of the time per image; those in
             ``shared_seconds`` (work that another estimator has done for it) are added to it; sentences in ``notes`` go
-            under the table.
+            under the table. Where ``seeks`` is True, no masks are read: its targets say which objects, and how often.
         results_dir: gets ``results.jsonl`` (a line per finished image: the record that resuming trusts),
             ``METHOD_DATASET-SPLIT.csv`` in BOP's form, the same with a column for the size (``.sized``),
             ``score.json`` and ``score.txt``.
@@ -69,13 +69,7 @@ def evaluate(
     folder = Path(results_dir)
     folder.mkdir(parents=True, exist_ok=True)
     chosen = None if objects is None else sorted(set(objects))
-    images = {
-        image: [t for t in rows if chosen is None or t.obj_id in chosen]
-        for image, rows in dataset.targets_by_image().items()
-    }
-    if not dataset.names_objects:  # nobody says what is in an image
-        images = {image: images.get(image, []) for image in dataset.target_images}
-    images = {image: rows for image, rows in images.items() if rows or not dataset.names_objects}
+    images = targets_of(dataset, chosen)
     if not images:
         raise DatasetError(f"{dataset.targets_file}: there are no targets of the objects asked for")
     alignments = dict(alignments or {})
@@ -93,6 +87,7 @@ def evaluate(
     by_image: dict[tuple[int, int], list[Detection]] = {}
     for detection in detections or ():
         by_image.setdefault((detection.scene_id, detection.im_id), []).append(detection)
+    seeks = getattr(estimator, "seeks", False)
     results = folder / f"{method.replace('_', '-')}_{dataset.name}-{dataset.split}.csv"
     with locked_folder(folder):
         journal = Journal(folder / "results.jsonl", head, restart)
@@ -102,7 +97,10 @@ def evaluate(
             try:
                 frame = dataset.frame(*image)
                 found = by_image.get(image, [])
-                if detections is None:
+                if seeks:
+                    told = images[image] if dataset.names_objects else []
+                    given, before = [Target(t.obj_id) for t in told for _ in range(t.count)], 0.0
+                elif detections is None:
                     given = [t for t in dataset.given_targets(*image) if chosen is None or t.obj_id in chosen]
                     before = 0.0
                 else:
@@ -110,7 +108,7 @@ def evaluate(
                     given = detected_targets(found, images[image]) if is_told else every_target(found, chosen)
                     before = max([d.time for d in found if d.time > 0], default=0.0)
                 start, uncounted = time.perf_counter(), _uncounted(estimator)
-                estimates = list(estimator(frame, given)) if given else []
+                estimates = list(estimator(frame, given)) if given or seeks else []
                 uncounted = _uncounted(estimator) - uncounted
                 seconds = max(time.perf_counter() - start - uncounted, 0.0) + before
                 estimates = [align(e, alignments[e.obj_id]) if e.obj_id in alignments else e for e in estimates]
@@ -148,6 +146,20 @@ def evaluate(
         found_score.write_json(folder / "score.json")
         write_text(folder / "score.txt", format_score(found_score) + "\n")
     return found_score
+
+
+def targets_of(dataset: Dataset, objects: Sequence[int] | None) -> dict[tuple[int, int], list[TargetRow]]:
+    """The targets of each image that has any of these objects (None = all).
+
+    Where nobody says what is in an image, every image, without targets.
+    """
+    images = {
+        image: [t for t in rows if objects is None or t.obj_id in objects]
+        for image, rows in dataset.targets_by_image().items()
+    }
+    if not dataset.names_objects:
+        images = {image: images.get(image, []) for image in dataset.target_images}
+    return {image: rows for image, rows in images.items() if rows or not dataset.names_objects}
 
 
 def _uncounted(estimator: Any) -> float:

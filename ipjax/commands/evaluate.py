@@ -64,8 +64,8 @@ def add(commands: Any) -> None:
         nargs="?",
         const="targets",
         choices=("targets", "all"),
-        help="use no masks: seek the objects that the targets name, or all of them in every image; also writes "
-        "detections.json, masks and boxes",
+        help="use no masks: seek the objects that the targets name, or all of them in every image (as where they name "
+        "none); also writes detections.json, masks and boxes",
     )
     parser.add_argument("--known-size", action="store_true", help="tell the method each object's true diameter")
     options.add_crop(parser)
@@ -125,7 +125,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     else:
         from ipjax.bop.detector import DatasetDetector
 
-        everything = arguments.detect == "all"
+        # Where the targets do not say what is in an image (BOP 2024), it may be anything.
+        everything = arguments.detect == "all" or not dataset.names_objects
         estimator = DatasetDetector(objects, encoder, config, **given, everything=everything, folder=masks)
     found = evaluate(
         dataset,
@@ -146,8 +147,9 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     )
     if arguments.detect is not None:
         from ipjax.bop.detector import join_detections
+        from ipjax.bop.evaluation import targets_of
 
-        join_detections(masks, arguments.output / "detections.json")
+        join_detections(masks, arguments.output / "detections.json", targets_of(dataset, list(objects)))
     messages.say(format_score(found))
     for line in estimator.refused:
         messages.say(f"not found: {line}")

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ipjax.bop.dataset import Dataset
 from ipjax.bop.evaluation import evaluate
 from ipjax.bop.records import DatasetError, Estimate
 from ipjax.bop.scoring.scores import score
@@ -116,6 +118,30 @@ def test_compilation_is_not_time_per_image(small, tmp_path):
 
     found = run(small, tmp_path, Slow(small))
     assert found.seconds_per_image is not None and 0 <= found.seconds_per_image < 0.1
+
+
+def test_what_seeks_needs_no_masks_and_nobody_who_says_what_is_there(small, tmp_path):
+    class Seeking(Noisy):
+        seeks = True
+
+        def __call__(self, frame, targets):
+            self.asked = [(t.obj_id, t.mask) for t in targets]
+            return super().__call__(frame, targets)
+
+    root = tmp_path / "bare"
+    shutil.copytree(small.root, root)
+    for folder in root.glob("test/*/mask_visib"):
+        shutil.rmtree(folder)
+    seeking = Seeking(small)
+    found = run(Dataset(root), tmp_path / "out", seeking)
+    assert found.all_frames == run(small, tmp_path / "with_masks", Noisy(small)).all_frames
+    assert seeking.asked == [(2, None), (3, None)] and len(seeking.calls) == 4
+    asked = [{"scene_id": scene, "im_id": image} for scene, image in small.target_images]
+    (root / "asked.json").write_text(json.dumps(asked))
+    again = Seeking(small)
+    unnamed = Dataset(root, targets="asked.json")
+    evaluate(unnamed, None, again, tmp_path / "asked", progress=False, metrics=("ap",))
+    assert len(again.calls) == 4 and again.asked == []
 
 
 def test_a_failure_stops_or_counts_as_a_miss(small, tmp_path):

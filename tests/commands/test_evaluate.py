@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from builders.bop_roots import write_ellipsoids
 
 from ipjax import cli
 from ipjax.bop.dataset import Dataset
-from ipjax.bop.detections import as_detection, write_detections
+from ipjax.bop.detections import as_detection, read_detections, write_detections
 from ipjax.bop.results import read_results
 from ipjax.commands import evaluate as evaluate_command
 
@@ -104,6 +105,22 @@ def test_detections_take_the_place_of_annotated_masks(place, whole, capsys):
     path.write_text(json.dumps([json.loads(path.read_text())[0] | {"segmentation": {}}]))
     words = ["evaluate", str(place / "balls"), "-o", str(place / "none"), "--detections", str(path)]
     assert cli.main(words) == 2 and "boxes, but no masks" in capsys.readouterr().err
+
+
+def test_objects_are_sought_where_no_mask_is_read(place, whole):
+    bare = place / "bare"
+    shutil.copytree(place / "balls", bare)
+    for folder in bare.glob("test/*/mask_visib"):
+        shutil.rmtree(folder)
+    words = ["ipjax", "evaluate", bare, "--objects", place / "objects", "-o", place / "sought", "--detect"]
+    finish(start(*words, "--config", place / "quick.json", "--quiet", "--metrics", "mssd", *VIEWS))
+    (path,) = (place / "sought").glob("*-sought_bare-test.csv")
+    rows, images = read_results(path), set(Dataset(bare).target_images)
+    assert rows and {(row.scene_id, row.im_id) for row in rows} <= images
+    found = read_detections(place / "sought" / "detections.json")
+    name = lambda one: (one.scene_id, one.im_id, one.obj_id)
+    assert [name(one) for one in found] == [name(row) for row in rows]
+    assert [one.score for one in found] == pytest.approx([row.score for row in rows])
 
 
 def test_the_tables_are_printed(place, whole):
