@@ -54,7 +54,9 @@ def same_instance(templates: Templates, first: Similarity, second: Similarity, a
 
 def sample_surface(templates: Templates) -> Float[jax.Array, "n 3"]:
     """As many points of every object's surface, so that they are compared by one program."""
-    points = np.asarray(templates.surface.points, np.float32)
+    surface = templates.surface
+    points = np.asarray(surface.points, np.float32)
+    points = points[np.asarray(surface.normals).any(axis=1)]  # padding repeats the first point, without a normal
     return jnp.asarray(points[np.linspace(0, len(points) - 1, SAMPLE).astype(int)])
 
 

@@ -64,7 +64,8 @@ def mask_from_pose(
       matrix: K of the image, pixels.
       depth: metres; 0 = unknown.
     """
-    points = templates.surface.points if templates.appearance is None else templates.appearance.points
+    drawn = templates.surface if templates.appearance is None else templates.appearance
+    points, count = drawn.points, max(int(np.asarray(drawn.normals).any(axis=1).sum()), 1)  # padding has no normals
     guessed = templates.reference is not None and not templates.reference.measured
     share = config.guessed_tolerance if guessed else config.tolerance
     tolerance = max(share * float(camera_from_object.scale), config.least_tolerance)
@@ -73,7 +74,7 @@ def mask_from_pose(
         0.5
         * (float(camera_from_object.scale) * matrix[0, 0] / max(float(camera_from_object.translation[2]), 1e-3)) ** 2
     )
-    radius = int(np.clip(np.ceil(np.sqrt(2 * area / points.shape[0])), CLOSING, MOST))
+    radius = int(np.clip(np.ceil(np.sqrt(2 * area / count)), CLOSING, MOST))
     pose = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), camera_from_object)
     whole, visible = draw_mask(
         jnp.asarray(points, jnp.float32),

@@ -90,7 +90,7 @@ class Verifier:
         value = float(found.confidence) * float(found.hypotheses.score[0])
         if self.diameter is None:
             return value
-        off = np.log(float(found.camera_from_object.scale) / self.diameter) / self.settings.size_deviation
+        off = np.log(float(found.diameter) / self.diameter) / self.settings.size_deviation
         return value * float(np.exp(-0.5 * off**2))
 
     def _mend(self, trials: Sequence[Trial], chosen: list[PoseEstimate], most: int) -> list[Trial]:

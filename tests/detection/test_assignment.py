@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from builders.detections import ellipsoid, place
 
-from ipjax.detection.assignment import Claim, assign, overlap, same_instance, shared_share
+from ipjax.detection.assignment import Claim, assign, overlap, same_instance, sample_surface, shared_share
+from ipjax.inference.batching import pad_alike
 from ipjax.records import Similarity
 
 
@@ -51,6 +53,14 @@ def test_turns_after_which_a_shape_looks_the_same_are_one_instance():
     moved = Similarity(pose.rotation, pose.translation + jnp.array([0.9 * 0.2, 0.0, 0.0]), pose.scale)
     assert not same_instance(templates, pose, moved, 0.1)
     assert jax.tree.all(jax.tree.map(np.array_equal, pose, place(0.0, 0.0)))
+
+
+def test_padding_is_no_surface():
+    templates = ellipsoid()[0]
+    few = eqx.tree_at(lambda t: t.surface, templates, jax.tree.map(lambda x: x[:300], templates.surface))
+    padded = pad_alike([few, templates])[0]
+    assert padded.surface.points.shape == templates.surface.points.shape
+    np.testing.assert_array_equal(sample_surface(padded), sample_surface(few))
 
 
 def test_shares_of_masks():

@@ -1,5 +1,7 @@
 """Objects are found in made frames without a mask: alone, several at once, several of one, and what is not there."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from builders.detections import HEIGHT, MATRIX, WIDTH, detector, ellipsoid, make_frame, place
@@ -46,6 +48,22 @@ def test_a_known_size_is_evidence_and_same_seed_gives_same_answer():
     assert wrong[0].value < 0.01 * free[0].value
     again = sought.seek(sight, 0)[0]
     assert np.array_equal(again[0].pose.rotation, free[0].pose.rotation) and again[0].value == free[0].value
+
+
+def test_a_known_size_is_compared_with_the_size_that_is_told(monkeypatch):
+    """Of an object from a photo without depth the pose's scale is that of the guessed shape."""
+    frame, sought = make_frame(place(0.05, -0.02, seed=3)), detector()
+    run = sought.estimator.run
+
+    def measured(*given, **options):
+        result = run(*given, **options)
+        longer = 1.5 * result.estimate.camera_from_object.scale
+        return dataclasses.replace(result, estimate=dataclasses.replace(result.estimate, diameter=longer))
+
+    monkeypatch.setattr(sought.estimator, "run", measured)
+    sight = sought.look(frame.rgb, frame.depth, MATRIX)
+    free, right, wrong = (sought.seek(sight, 0, diameter=size)[0] for size in (None, 0.3, 0.2))
+    assert right[0].value > 0.5 * free[0].value and wrong[0].value < 0.01 * free[0].value
 
 
 def test_frames_that_cannot_be_searched_are_refused_in_words():

@@ -1,10 +1,13 @@
 """The mask of a posed object: its outline, without what hides it or is not it."""
 
+import equinox as eqx
+import jax
 import numpy as np
 from builders.detections import MATRIX, ellipsoid, make_frame, place
 
 from ipjax.detection.assignment import overlap
 from ipjax.detection.masks import mask_from_pose
+from ipjax.inference.batching import pad_alike
 
 
 def test_the_mask_is_the_visible_part_of_the_outline():
@@ -24,3 +27,11 @@ def test_depth_that_is_unknown_is_kept_and_another_depth_is_not():
     assert overlap(mask_from_pose(ellipsoid()[0], pose, MATRIX, holes)[0], frame.masks[0]) > 0.93
     farther = np.where(frame.depth > 0, frame.depth + np.float32(0.05), 0).astype(np.float32)
     assert not mask_from_pose(ellipsoid()[0], pose, MATRIX, farther)[0].any()
+
+
+def test_gaps_between_few_points_are_closed_also_where_they_are_padded():
+    templates, pose = ellipsoid()[0], place(0.0, 0.0)
+    few = eqx.tree_at(lambda t: t.appearance, templates, jax.tree.map(lambda x: x[:1000], templates.appearance))
+    frame = make_frame(pose)
+    plain, padded = (mask_from_pose(one, pose, MATRIX, frame.depth)[1] for one in (few, pad_alike([few, templates])[0]))
+    assert overlap(plain, frame.masks[0]) > 0.85 and np.array_equal(padded, plain)

@@ -59,6 +59,8 @@ def propose(rgb: Any, depth: Any, camera: Any, config: ProposalConfig | None = N
     rgb, depth, matrix = _check(rgb, depth, camera, config)
     made = make_all(rgb, depth, matrix, config)
     masks, measures, owner = pool(made)
+    if not len(masks):
+        return Proposals(np.zeros((0, *depth.shape), bool), np.zeros(0))
     objectness = np.concatenate([judge(each) for each in measures])
     if config.diameters:
         length = np.concatenate([each.length for each in measures])
@@ -96,9 +98,9 @@ def pool(made: list[Candidates]) -> tuple[np.ndarray, list[Measures], np.ndarray
     height, width = made[0].labels.shape
     masks = np.concatenate([one.sample(width, height) for one in made])
     step = max(round(max(height, width) / 80), 1)
-    votes = count_votes(
-        masks[:, step // 2 :: step, step // 2 :: step].reshape(len(masks), -1), np.concatenate([m.ways for m in made])
-    )
+    few = masks[:, step // 2 :: step, step // 2 :: step]
+    few = few.reshape(len(masks), few.shape[1] * few.shape[2])
+    votes = count_votes(few, np.concatenate([m.ways for m in made]))
     begin = np.cumsum([len(one.ways) for one in made])[:-1]
     each = [dataclasses.replace(one.measures, votes=v) for one, v in zip(made, np.split(votes, begin), strict=True)]
     owner = [(which, row) for which, one in enumerate(made) for row in range(len(one.ways))]

@@ -115,6 +115,13 @@ def test_a_known_diameter_leaves_out_what_is_longer(three):
     assert best_overlaps(small, masks)[1] >= 0.8
 
 
+def test_no_mask_of_an_allowed_size_is_no_error():
+    grey = np.full((60, 80, 3), 100, np.uint8)
+    config = ProposalConfig(cuttings=(Cutting(least=0.2499),))
+    found = propose(grey, np.ones((60, 80), np.float32), (100, 100, 40, 30), config)
+    assert found.masks.shape == (0, 60, 80) and found.objectness.shape == (0,)
+
+
 def test_nothing_to_see_is_no_error():
     grey = np.full((60, 80, 3), 100, np.uint8)
     proposals = propose(grey, np.ones((60, 80), np.float32), (100, 100, 40, 30))
