@@ -46,7 +46,7 @@ class Detector:
         objects: templates and what is known of them, as `ipjax.load` returns them. Of each, ``detection.views``
             templates are used, and kept in memory: with an iterator that loads them, no more than that and one object.
         encoder: made the templates' features.
-        config: of the estimates that verify proposals.
+        config: of the estimates that verify proposals; None = `Config.fast`.
         detection: how objects are sought.
         proposals: how a frame is cut up; None = as by default.
         quick: as `ipjax.Estimator` has it.
@@ -114,7 +114,6 @@ class Detector:
         Raises:
             ValueError: the images do not fit together, or there is no depth; in words.
         """
-        sight = self.look(rgb, depth, camera, depth_scale)
         most = self.detection.instances if instances is None else instances
         if most < 1:
             raise ValueError(f"at least one instance must be sought, not {instances}")
@@ -122,6 +121,9 @@ class Detector:
         diameters = [None] * count if diameters is None else list(diameters)
         if len(diameters) != count:
             raise ValueError(f"{count} objects and {len(diameters)} diameters")
+        if not all(one is None or 0 < one < np.inf for one in diameters):
+            raise ValueError(f"diameters are positive metres, or None, not {diameters}")
+        sight = self.look(rgb, depth, camera, depth_scale)
         claims: list[Claim] = []
         rejected: list[Rejected] = []
         for index in bar(range(count), desc="detecting", unit=" objects", disable=not progress or count < 2):

@@ -80,6 +80,9 @@ def test_frames_that_cannot_be_searched_are_refused_in_words():
         sought.detect(frame.rgb, frame.depth, MATRIX, instances=0)
     with pytest.raises(ValueError, match="2 objects and 1 diameters"):
         sought.detect(frame.rgb, frame.depth, MATRIX, diameters=[0.1])
+    for size in (0.0, -0.1, np.nan):
+        with pytest.raises(ValueError, match="positive metres"):
+            sought.detect(frame.rgb, frame.depth, MATRIX, diameters=[size, None])
     with pytest.raises(ValueError, match="at least one object"):
         type(sought)([], None)
 
