@@ -34,6 +34,7 @@ def scene(tmp_path, monkeypatch):
     monkeypatch.setattr("ipjax.config.Config.fast", lambda: DRAWN)
     monkeypatch.setattr(options, "read_config", lambda arguments: DRAWN)
     templates, info = detections.ellipsoid()
+    assert templates.appearance is not None
     vertices = np.asarray(templates.appearance.points[::40], np.float32)
     save(tmp_path / "mug.ipjax", templates, dataclasses.replace(info, encoder="coordinates", vertices=vertices))
     frame = detections.make_frame(detections.place(-0.12, 0.0, seed=1), detections.place(0.12, 0.02, seed=2))
