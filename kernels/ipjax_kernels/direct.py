@@ -39,7 +39,8 @@ class Prior(NamedTuple):
 
     rotation: Float[Array, "3 3"]
     translation: Float[Array, "3"]
-    information: Float[Array, "6 6"]  # of (turn about the points' centre, shift): the loss grows by ½ δᵀ information δ
+    information: Float[Array, "6 6"]  # of (turn about the middle, shift): the loss grows by ½ δᵀ information δ
+    middle: Float[Array, "3"]  # points' unit: near their centre
 
 
 class Alignment(NamedTuple):
@@ -84,7 +85,7 @@ def align_directly(
       facing: the least cosine between a point's normal and the direction to the camera, with which it counts.
     """
     share = points.weight / jnp.maximum(jnp.sum(points.weight), 1e-12)
-    middle = jnp.sum(share[:, None] * points.places, axis=0)
+    middle = jnp.sum(share[:, None] * points.places, axis=0) if prior is None else prior.middle
     # Turned about their centre, so that turn and shift are as independent as they can be.
     places = points.places - middle
     translation = translation + jnp.sum(rotation * middle[None], axis=1)

@@ -84,7 +84,8 @@ def test_where_nothing_has_texture_the_prior_decides_and_texture_outweighs_a_wea
     expected = jnp.asarray(turned(rotation, 2, 2.0), jnp.float32)
     off = lambda found, to: Rotation.from_matrix(np.asarray(found.rotation, np.float64) @ np.asarray(to).T).magnitude()
     plain = points._replace(colours=0 * points.colours), picture._replace(values=picture.values.at[..., :9].set(0))
-    strong = Prior(expected, shift, jnp.diag(jnp.array([10.0, 10, 10, 1e3, 1e3, 1e3])))
+    middle = jnp.sum(points.weight[:, None] * points.places, axis=0) / jnp.sum(points.weight)
+    strong = Prior(expected, shift, jnp.diag(jnp.array([10.0, 10, 10, 1e3, 1e3, 1e3])), middle)
     assert np.degrees(off(align(start, shift, *plain, strong, steps=20), expected)) < 0.1
     weak = strong._replace(information=1e-3 * strong.information)
     found = align(start, shift, points, picture, weak, steps=20)
@@ -92,6 +93,21 @@ def test_where_nothing_has_texture_the_prior_decides_and_texture_outweighs_a_wea
     # The loss that is told is that of the image alone.
     alone = align(found.rotation, found.translation, points, picture, steps=0)
     np.testing.assert_allclose(float(found.loss), float(alone.loss), atol=1e-3)
+
+
+def test_a_prior_is_about_its_own_middle_wherever_the_points_lie():
+    """One that knows where its middle is, and no turn, lets the camera turn about that and about nothing else."""
+    points, picture, rotation, translation = scene(2)
+    plain = points._replace(colours=0 * points.colours), picture._replace(values=picture.values.at[..., :9].set(0))
+    middle = np.array([0.03, -0.02, 0.01])
+    start = turned(rotation, 2, 4.0)
+    shift = translation + (rotation - start) @ middle
+    knows = jnp.diag(jnp.array([0.0, 0, 0, 1e3, 1e3, 1e3]))
+    single = lambda x: jnp.asarray(x, jnp.float32)
+    prior = Prior(single(rotation), single(translation), knows, single(middle))
+    found = align(single(start), single(shift), *plain, prior, steps=20)
+    np.testing.assert_allclose(np.asarray(found.rotation), start, atol=1e-4)
+    np.testing.assert_allclose(np.asarray(found.translation), shift, atol=1e-5)
 
 
 @pytest.mark.parametrize("fault", ["no points", "no normals", "no image", "one colour", "behind"])

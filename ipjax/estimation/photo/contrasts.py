@@ -145,7 +145,7 @@ def expect(
         * config.patches
         * jnp.matmul(jnp.matmul(moved.T, fit.information, precision="highest"), moved, precision="highest")
     )
-    return Prior(fit.rotation, fit.translation, information)
+    return Prior(fit.rotation, fit.translation, information, comparison.middle)
 
 
 def align_colours(comparison: Comparison, prior: Prior, config: ResectConfig) -> Alignment:

@@ -81,6 +81,7 @@ def compare_drawings(
         return jax.tree.map(lambda all_of_them, new: all_of_them.at[one].set(new), priors, prior), first, best
 
     nothing = jnp.zeros((count, 6, 6), found.translation.dtype)
-    start = Prior(found.rotation, found.translation, nothing), absent
+    middles = jnp.broadcast_to(comparison.middle, (count, 3))
+    start = Prior(found.rotation, found.translation, nothing, middles), absent
     best = Compared(found.rotation, found.translation, absent, blank)
     return lax.fori_loop(0, count + polished * config.rounds, step, (*start, best))[2]

@@ -62,8 +62,9 @@ def painted(pair: PhotoPair, seed: int) -> PhotoPair:
 @pytest.fixture(scope="module")
 def align():
     def run(reference, query, turn, shift):
-        anywhere = Prior(turn, shift, jnp.zeros((6, 6)))
-        wide = align_colours(prepare_comparison(reference, query), anywhere, CONFIG)
+        comparison = prepare_comparison(reference, query)
+        anywhere = Prior(turn, shift, jnp.zeros((6, 6)), comparison.middle)
+        wide = align_colours(comparison, anywhere, CONFIG)
         sight = measure_sight(reference, query)
         return wide, align_drawn(reference, query, wide.rotation, wide.translation, anywhere, sight, CONFIG)
 
