@@ -35,7 +35,7 @@ from ipjax.detection.detector import Detector
 from ipjax.detection.rough import estimate_again
 from ipjax.files.objects.loading import load
 from ipjax.files.provenance import hash_executed
-from ipjax.files.storage.writing import write_text
+from ipjax.files.storage.writing import append_json, write_text
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.inference.compilation_cache import use_compilation_cache
 from ipjax.progress import bar
@@ -389,8 +389,7 @@ def measure(bench: Bench, head: dict[str, Any], path: Path) -> list[dict[str, An
         bench.detector.seek(sight, 0)
     for image in bar(images, desc=bench.dataset.name, unit=" images"):
         lines.append(bench.run(image))
-        with path.open("a") as file:
-            file.write(json.dumps(lines[-1]) + "\n")
+        append_json(path, lines[-1])
     return lines
 
 

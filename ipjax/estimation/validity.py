@@ -66,8 +66,8 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
     view is treated as a view, and its patches as patches.
 
     Returns:
-      The templates, and whether the object is usable: it has a finite surface point, its axes, mean and basis are
-      finite throughout, and so are pose and camera of its reference view, if it has one.
+      The templates, and whether the object is usable: it has a finite surface point, its axes, extents, mean and
+      basis are finite throughout, and so are pose and camera of its reference view, if it has one.
     """
     patches, pose = templates.patches, templates.camera_from_object
     camera, has_camera = _finite_camera(templates.camera)
@@ -81,7 +81,12 @@ def finite_templates(templates: Templates) -> tuple[Templates, Bool[Array, ""]]:
         valid=valid,
     )
     surface, has_points = _finite_points(templates.surface)
-    needed = [templates.mean, templates.axes, *([] if templates.basis is None else [templates.basis])]
+    needed = [
+        templates.mean,
+        templates.axes,
+        templates.extents,
+        *([] if templates.basis is None else [templates.basis]),
+    ]
     reference, has_place = None, []
     if templates.reference is not None:
         reference, has_reference = _finite_reference(templates.reference)

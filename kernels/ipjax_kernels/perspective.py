@@ -164,7 +164,7 @@ def refine_resection(
     return Resection(rotation, translation, loss, hessian)
 
 
-def exponential(turn):
+def exponential(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """The rotation by |turn| about it (Rodrigues), exact at zero, too."""
     squared = jnp.sum(turn**2)
     small = squared < 1e-8

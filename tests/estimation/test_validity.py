@@ -53,7 +53,7 @@ MEANING = {
     "templates.mean": "nothing",
     "templates.axes": "nothing",
     "templates.seen": "unused",
-    "templates.extents": "unused",
+    "templates.extents": "nothing",
     "query.patches.features": "query patch",
     "query.patches.points": "query patch",
     "query.patches.grid": "query patch",
@@ -91,7 +91,7 @@ def mark_absent(leaves: dict[str, np.ndarray], name: str, places: np.ndarray) ->
     """Say in the record's own words that what stands at some places (rows of indices) of a leaf is not there."""
     record = name.rpartition(".")[0]
     rows = tuple(places.T)
-    meaning = MEANING[name]
+    meaning = (THROUGH_PHOTO | MEANING)[name]
     if meaning == OF_PATCH:
         leaves["templates.patches.valid"][rows[:2]] = False
     elif meaning == OF_VIEW:
@@ -100,6 +100,9 @@ def mark_absent(leaves: dict[str, np.ndarray], name: str, places: np.ndarray) ->
         last = "colours" if meaning == OF_COLOURED_POINT else "seen"
         for field in ("normals", last):
             leaves[f"{record}.{field}"][rows[0]] = 0
+        for field in ("along_std", "across_std"):
+            if f"{record}.{field}" in leaves:
+                leaves[f"{record}.{field}"][rows[0]] = 0
         kept = np.setdiff1d(np.arange(len(leaves[name])), rows[0])[0]
         leaves[f"{record}.points"][rows[0]] = leaves[f"{record}.points"][kept]
     elif meaning == "query patch":
@@ -301,6 +304,7 @@ def test_a_reference_view_is_absent_where_it_is_no_number(name, bad):
 # only tells how well the depth agrees.
 THROUGH_PHOTO = {name: meaning for name, meaning in MEANING.items() if ".appearance" not in name}
 THROUGH_PHOTO |= {"templates.seen": OF_PATCH}
+THROUGH_PHOTO |= {f"templates.surface.{field}": OF_POINT for field in ("along_std", "across_std")}
 THROUGH_PHOTO |= {f"templates.reference{name}": meaning for name, meaning in OF_REFERENCE.items()}
 
 

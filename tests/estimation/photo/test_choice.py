@@ -90,4 +90,6 @@ def test_without_drawing_the_photo_is_not_asked():
         with_photo, without = (
             estimate(used, templates, query, jax.random.key(0), config, None) for templates in (made.templates, plain)
         )
-        jax.tree.map(np.testing.assert_array_equal, with_photo, without)
+        # Two graphs, which are compiled apart, and so round apart.
+        same = lambda a, b: np.testing.assert_allclose(np.asarray(a), np.asarray(b), rtol=1e-5, atol=1e-6)
+        jax.tree.map(same, with_photo, without)
