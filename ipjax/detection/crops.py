@@ -7,11 +7,11 @@ import numpy as np
 
 from ipjax.detection.signatures import Signature
 from ipjax.files.cameras.reading import as_intrinsics
-from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import remove_sentinel
 from ipjax.inference.cutting import undistort_frame
 from ipjax.inference.depth import check_frame_unit, find_depth_scale, to_metres
 from ipjax.inference.frames import cut_object
+from ipjax.inference.images import check_images
 from ipjax.records import Patches, Similarity, View
 
 
@@ -42,33 +42,11 @@ def read_scene(rgb: Any, depth: Any, camera: Any, depth_scale: float | None = No
         ValueError: sizes differ, the unit of the depth is not known or cannot be right, or there is no depth; in words.
     """
     intrinsics = as_intrinsics(camera)
-    rgb = as_native(np.asarray(rgb))
-    rgb = np.repeat(rgb[..., None], 3, axis=-1) if rgb.ndim == 2 else rgb
-    if rgb.ndim != 3 or rgb.shape[-1] not in (3, 4) or rgb.size == 0:
-        raise ValueError(f"rgb must be height × width × 3, not {' × '.join(map(str, rgb.shape)) or 'a number'}")
-    rgb = rgb[..., :3]
-    if rgb.dtype == np.uint16:
-        rgb = (rgb >> 8).astype(np.uint8)
-    elif rgb.dtype.kind == "f":
-        if not np.isfinite(rgb).all() or rgb.min() < -0.01 or rgb.max() > 1.01:
-            raise ValueError("rgb as floats must be finite and in [0, 1]")
-        rgb = (np.clip(rgb, 0, 1) * 255 + 0.5).astype(np.uint8)
-    elif rgb.dtype != np.uint8:
-        raise ValueError(f"rgb must be uint8, uint16 or float in [0, 1], not {rgb.dtype}")
-    rgb = np.ascontiguousarray(rgb)
-    height, width = rgb.shape[:2]
     if depth is None:
         raise ValueError("there is no depth image: objects are sought, and masks are mended, by depth")
-    depth = as_native(np.asarray(np.ma.filled(depth, 0)))
-    depth = depth[..., 0] if depth.ndim == 3 and depth.shape[-1] == 1 else depth
-    if depth.shape != (height, width):
-        raise ValueError(f"rgb is {width} × {height}, but depth is {' × '.join(map(str, depth.shape[::-1]))}")
-    if depth.dtype.kind not in "uif":
-        raise ValueError(f"depth must be numbers, not {depth.dtype}")
-    if intrinsics.size is not None and intrinsics.size != (width, height):
-        raise ValueError(
-            f"the camera is for images of {intrinsics.size[0]} × {intrinsics.size[1]}, but rgb is {width} × {height}"
-        )
+    rgb, depth = check_images(rgb, depth, intrinsics)
+    if rgb.dtype != np.uint8:  # proposals look at colours of eight bits
+        rgb = (rgb * 255 + 0.5).astype(np.uint8)
     depth, _ = remove_sentinel(depth)
     scale = find_depth_scale(depth, depth_scale, intrinsics)
     check_frame_unit(depth, scale)

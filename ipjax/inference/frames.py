@@ -11,11 +11,11 @@ import numpy as np
 
 from ipjax.files.cameras.intrinsics import list_misfits
 from ipjax.files.cameras.reading import as_intrinsics
-from ipjax.files.images.arrays import as_native
 from ipjax.files.images.depth import remove_sentinel
 from ipjax.files.images.masks import as_mask, check_mask
 from ipjax.inference.cutting import cut_look_at, cut_square, undistort_frame
 from ipjax.inference.depth import check_depth_unit, find_depth_scale
+from ipjax.inference.images import check_images, size_in_words
 from ipjax.inference.masks import drop_specks, find_nearest_object
 from ipjax.records import Camera, Similarity, View
 
@@ -124,27 +124,15 @@ def frame_turned(
         if not (np.ndim(value) == 0 and np.isfinite(value) and value >= 0):
             raise ValueError(f"{name} must be a finite number from 0 on, not {value!r}")
     intrinsics = as_intrinsics(camera)
-    rgb = _check_rgb(rgb)
+    rgb, depth = check_images(rgb, depth, intrinsics)
     height, width = rgb.shape[:2]
-    depth = as_native(np.asarray(np.ma.filled(depth, 0)))  # what a masked array masks is unknown
-    depth = depth[..., 0] if depth.ndim == 3 and depth.shape[-1] == 1 else depth
-    if depth.shape != (height, width):
-        raise ValueError(
-            f"rgb is {width} × {height} but depth is {_size_in_words(depth)}; align the depth to the colour image first"
-        )
-    if intrinsics.size is not None and intrinsics.size != (width, height):
-        raise ValueError(
-            f"the camera is for images of {intrinsics.size[0]} × {intrinsics.size[1]}, but rgb is {width} × {height}"
-        )
-    if depth.dtype.kind not in "uif":
-        raise ValueError(f"depth must be numbers, not {depth.dtype}")
     if mask is None and box is None:
         raise ValueError("a mask or a box must say where the object is")
     region = None if box is None else _check_box(box, width, height)
     if mask is not None:
         mask = as_mask(mask)
         if mask.shape != (height, width):
-            raise ValueError(f"rgb is {width} × {height} but the mask is {_size_in_words(mask)}")
+            raise ValueError(f"rgb is {width} × {height} but the mask is {size_in_words(mask)}")
         if not mask.any():
             raise ValueError("the mask is empty")
         if region is None:
@@ -241,28 +229,6 @@ def cut_object(
     return view, Similarity(rotation, np.zeros(3), np.ones(())).to_jax()
 
 
-def _check_rgb(rgb: Any) -> np.ndarray:
-    """uint8 or float32 in [0, 1], height × width × 3."""
-    rgb = as_native(np.asarray(rgb))
-    if rgb.ndim == 2:
-        rgb = np.repeat(rgb[..., None], 3, axis=-1)
-    if rgb.ndim != 3 or rgb.shape[-1] not in (3, 4) or rgb.size == 0:
-        raise ValueError(f"rgb must be height × width × 3, not {' × '.join(map(str, rgb.shape)) or 'a number'}")
-    rgb = rgb[..., :3]
-    if rgb.dtype == np.uint8:
-        return np.ascontiguousarray(rgb)
-    if rgb.dtype == np.uint16:
-        return rgb.astype(np.float32) / 65535
-    if rgb.dtype.kind != "f":
-        raise ValueError(f"rgb must be uint8, uint16 or float in [0, 1], not {rgb.dtype}")
-    rgb = rgb.astype(np.float32)
-    if not np.isfinite(rgb).all():
-        raise ValueError("rgb has values that are not finite")
-    if rgb.min() < -0.01 or rgb.max() > 1.01:
-        raise ValueError(f"rgb as floats must be in [0, 1]; it goes from {rgb.min():g} to {rgb.max():g}")
-    return rgb.clip(0, 1)
-
-
 def _check_box(box: Any, width: int, height: int) -> tuple[int, int, int, int]:
     """(left, top, right, bottom) in whole pixels, inside the image."""
     try:
@@ -279,9 +245,3 @@ def _check_box(box: Any, width: int, height: int) -> tuple[int, int, int, int]:
     if left >= right or top >= bottom:
         raise ValueError(f"the box ({x:g}, {y:g}, {w:g}, {h:g}) lies outside the image of {width} × {height}")
     return left, top, right, bottom
-
-
-def _size_in_words(image: np.ndarray) -> str:
-    if image.ndim == 2:
-        return f"{image.shape[1]} × {image.shape[0]}"
-    return " × ".join(map(str, image.shape)) or "a number"

@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ipjax_kernels.perspective import exponential
-from ipjax_kernels.positive import root, solve_positive
+from ipjax_kernels.positive import root
+from ipjax_kernels.rigid import descend
+
+LONGEST = 0.15  # rad: turn of one step; an image's slopes tell little of what is farther away
 
 
 class Picture(NamedTuple):
@@ -125,34 +126,17 @@ def align_directly(
         slope = jnp.einsum("kca,kc,k->a", slopes, offset, each, precision="highest")
         loss = jnp.where(jnp.any(counted > 0), loss, 1)
         if prior is None:
-            return loss, loss, hessian, slope
+            return loss, hessian, slope, loss
         # The axis of a small turn, exact to its third order.
         turn = jnp.matmul(rotation, prior.rotation.T, precision="highest")
         axis = jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
         expected = prior.translation + jnp.sum(prior.rotation * middle[None], axis=1)
         away = jnp.concatenate([axis, translation - expected])
         pull = jnp.sum(prior.information * away[None], axis=1)
-        return loss + jnp.sum(pull * away) / 2, loss, hessian + prior.information / 2, slope + pull / 2
+        return loss + jnp.sum(pull * away) / 2, hessian + prior.information / 2, slope + pull / 2, loss
 
-    def step(state, _):
-        rotation, translation, (total, loss, hessian, slope), damping = state
-        diagonal = jnp.diagonal(hessian)
-        largest = jnp.max(diagonal)
-        floor = jnp.where(largest > 1e-12, 1e-9 * largest, 1)
-        move = -solve_positive(hessian + jnp.diag(damping * diagonal + floor), slope)
-        length = root(jnp.sum(move[:3] ** 2))
-        move = move * jnp.minimum(1, 0.15 / jnp.maximum(length, 1e-6))
-        new_rotation = jnp.matmul(exponential(move[:3]), rotation, precision="highest")
-        new_translation = translation + move[3:]
-        new = evaluate(new_rotation, new_translation)
-        better = new[0] < total
-        choose = lambda fresh, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), fresh, old)
-        state = choose((new_rotation, new_translation, new), (rotation, translation, (total, loss, hessian, slope)))
-        return (*state, jnp.clip(jnp.where(better, damping / 4, damping * 5), 1e-5, 1e5)), None
-
-    start = rotation, translation, evaluate(rotation, translation), jnp.asarray(1e-2, translation.dtype)
-    (rotation, translation, (_, loss, _, _), _), _ = lax.scan(step, start, None, length=steps)
-    return Alignment(rotation, translation - jnp.sum(rotation * middle[None], axis=1), loss)
+    rotation, translation, here = descend(evaluate, rotation, translation, longest=LONGEST, steps=steps)
+    return Alignment(rotation, translation - jnp.sum(rotation * middle[None], axis=1), here[3])
 
 
 def _sample(image: Float[Array, "h w d"], pixels: Float[Array, "k 2"]) -> Float[Array, "k d"]:

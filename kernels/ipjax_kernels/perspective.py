@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ipjax_kernels.positive import root, solve_positive
+from ipjax_kernels.positive import root
+from ipjax_kernels.rigid import descend
 
 
 class Weak(NamedTuple):
@@ -140,38 +140,6 @@ def refine_resection(
         slope = jnp.einsum("kia,ki,k->a", slopes, offset / width, each, precision="highest")
         return jnp.sum(share * loss), hessian, slope
 
-    def step(state, _):
-        rotation, translation, (loss, hessian, slope), damping = state
-        diagonal = jnp.diagonal(hessian)
-        largest = jnp.max(diagonal)
-        # Where nothing tells the pose it stays, and its derivative, in which the inverse is squared, is finite.
-        floor = jnp.where(largest > 1e-12, 1e-9 * largest, 1)
-        damped = hessian + jnp.diag(damping * diagonal + floor)
-        move = -solve_positive(damped, slope)
-        length = root(jnp.sum(move[:3] ** 2))
-        move = move * jnp.minimum(1, 0.5 / jnp.maximum(length, 1e-6))
-        new_rotation = jnp.matmul(exponential(move[:3]), rotation, precision="highest")
-        new_translation = translation + move[3:]
-        new = evaluate(new_rotation, new_translation)
-        better = new[0] < loss
-        choose = lambda fresh, old: jax.tree.map(lambda a, b: jnp.where(better, a, b), fresh, old)
-        state = choose((new_rotation, new_translation, new), (rotation, translation, (loss, hessian, slope)))
-        return (*state, jnp.clip(jnp.where(better, damping / 5, damping * 5), 1e-6, 1e6)), None
-
-    start = rotation, translation, evaluate(rotation, translation), jnp.asarray(1e-2, points.dtype)
-    (rotation, translation, (loss, hessian, _), _), _ = lax.scan(step, start, None, length=steps)
+    rotation, translation, (loss, hessian, _) = descend(evaluate, rotation, translation, longest=0.5, steps=steps)
     translation = translation - jnp.sum(rotation * middle[None], axis=1)
     return Resection(rotation, translation, loss, hessian)
-
-
-def exponential(turn: Float[Array, "3"]) -> Float[Array, "3 3"]:
-    """The rotation by |turn| about it (Rodrigues), exact at zero, too."""
-    squared = jnp.sum(turn**2)
-    small = squared < 1e-8
-    angle = root(jnp.where(small, 1, squared))
-    sine = jnp.where(small, 1 - squared / 6, jnp.sin(angle) / angle)
-    versine = jnp.where(small, 0.5 - squared / 24, (1 - jnp.cos(angle)) / jnp.where(small, 1, squared))
-    x, y, z = turn
-    zero = jnp.zeros_like(x)
-    cross = jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
-    return jnp.eye(3, dtype=turn.dtype) + sine * cross + versine * jnp.matmul(cross, cross, precision="highest")

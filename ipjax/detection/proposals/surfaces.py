@@ -33,7 +33,8 @@ class Surfaces:
     @property
     def shape(self) -> tuple[int, int]:
         """Height and width."""
-        return self.depth.shape  # type: ignore[return-value]
+        height, width = self.depth.shape
+        return height, width
 
 
 def make_surfaces(
@@ -55,10 +56,16 @@ def make_surfaces(
     points = unproject(camera.astype(np.float32), pixels, filled.reshape(-1)).reshape(height, width, 3)
     normals = _find_normals(points)
     inverse = 1 / filled
-    jump = tuple(_jump(inverse, filled, axis) * _both(trusted, axis) for axis in (1, 0))
-    contrast = tuple(_contrast(cv2.GaussianBlur(lab, (0, 0), 0.7), axis) for axis in (1, 0))
-    crease = tuple(_crease(normals, points, axis) * _both(trusted, axis) for axis in (1, 0))
-    return Surfaces(lab, filled, known, trusted, points, normals, camera, jump, contrast, crease)  # type: ignore
+    smooth = cv2.GaussianBlur(lab, (0, 0), 0.7)
+
+    def between(axis: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        both = _both(trusted, axis)
+        jump, crease = _jump(inverse, filled, axis), _crease(normals, points, axis)
+        return jump * both, _contrast(smooth, axis), crease * both
+
+    across, down = between(1), between(0)
+    jump, contrast, crease = ((right, below) for right, below in zip(across, down, strict=True))
+    return Surfaces(lab, filled, known, trusted, points, normals, camera, jump, contrast, crease)
 
 
 def _shrink_depth(depth: np.ndarray, width: int, height: int) -> Float[np.ndarray, "h w"]:
@@ -78,7 +85,9 @@ def _fill(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Depth with the nearest measurement where there is none, and how many pixels away that is."""
     if not (depth > 0).any():
         return np.ones_like(depth), np.full(depth.shape, np.inf)
-    distance, index = ndimage.distance_transform_edt(depth <= 0, return_indices=True)  # type: ignore[misc]
+    places = ndimage.distance_transform_edt(depth <= 0, return_distances=False, return_indices=True)
+    index = np.asarray(places)
+    distance = np.hypot(*(index - np.indices(depth.shape)))
     return np.ascontiguousarray(depth[tuple(index)]), distance
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from ipjax_kernels.direct import Alignment, Picture, Points, Prior, align_directly, make_picture
 from ipjax_kernels.perspective import Resection
 from ipjax_kernels.positive import root
+from ipjax_kernels.rigid import carry
 from jaxtyping import Array, Bool, Float
 
 from ipjax.cameras import point_map
@@ -135,17 +136,10 @@ def expect(
     total = jnp.sum(weight)
     centre = jnp.sum(weight[:, None] * points, axis=0) / jnp.where(total > 1e-12, total, 1)
     # A turn about the comparison's middle shifts the centre of what was fitted, too.
-    x, y, z = jnp.matmul(fit.rotation, centre - comparison.middle, precision="highest")
-    zero = jnp.zeros_like(x)
-    lever = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
-    moved = jnp.eye(6, dtype=lever.dtype).at[3:, :3].set(lever)
+    moved = carry(jnp.matmul(fit.rotation, centre - comparison.middle, precision="highest"))
     # Of Gauss and Newton's loss, which grows by δᵀ information δ.
-    information = (
-        2
-        * config.patches
-        * jnp.matmul(jnp.matmul(moved.T, fit.information, precision="highest"), moved, precision="highest")
-    )
-    return Prior(fit.rotation, fit.translation, information, comparison.middle)
+    information = jnp.matmul(jnp.matmul(moved.T, fit.information, precision="highest"), moved, precision="highest")
+    return Prior(fit.rotation, fit.translation, 2 * config.patches * information, comparison.middle)
 
 
 def align_colours(comparison: Comparison, prior: Prior, config: ResectConfig) -> Alignment:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from ipjax_kernels.perspective import Resection, refine_resection
 from ipjax_kernels.positive import invert_positive, root
+from ipjax_kernels.rigid import carry
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
@@ -196,10 +197,7 @@ def _spread(
     found = found.at[5, :].set(0).at[:, 5].set(0)
     # A turn about the points' centre moves the object's, too, by turn × arm. (That the pose is the inverse of what was
     # fitted changes both signs, and so no product.)
-    x, y, z = arm / scale
-    zero = jnp.zeros_like(x)
-    lever = jnp.stack([jnp.stack([zero, z, -y]), jnp.stack([-z, zero, x]), jnp.stack([y, -x, zero])])
-    to_object = jnp.eye(6, dtype=dtype).at[3:, :3].set(lever)
+    to_object = carry(arm / scale)
     of_guess = jnp.zeros((6, 6), dtype).at[5, 5].set(guess**2)
     moved = jnp.matmul(jnp.matmul(to_object, found, precision="highest"), to_object.T, precision="highest") + of_guess
     back = jnp.zeros((6, 6), dtype).at[:3, :3].set(turn.T).at[3:, 3:].set(turn.T) * unit[:, None]

@@ -1,15 +1,18 @@
 """What detectors and segmenters write: BOP's and COCO's JSON, CNOS's and SAM-6D's npz, SAM's own list of masks.
 
-An annotation is read without its mask, which is decoded when it is asked for: a file may hold those of a whole data set.
+An annotation is read without its mask, which is decoded when it is asked for:
+a file may hold those of a whole data set.
 
-| of | what is read | described in |
-|---|---|---|
-| BOP, CNOS, SAM-6D | a list of scene_id, image_id, category_id, score, bbox, segmentation, time | https://bop.felk.cvut.cz/challenges/bop-challenge-2022/ (5.1) |
-| CNOS, SAM-6D (npz) | the same names, an array each: masks [n, h, w] | https://github.com/nv-nguyen/cnos (src/model/utils.py) |
-| COCO | results, or a data set with images and annotations | https://cocodataset.org/#format-data |
-| SAM | a list of segmentation, predicted_iou, stability_score | https://github.com/facebookresearch/segment-anything (automatic_mask_generator.py) |
-| Grounded-SAM | annotations with segmentation and score, img_width, img_height | https://github.com/IDEA-Research/Grounded-SAM-2 |
-"""  # noqa: E501
+* BOP, CNOS, SAM-6D: a list of scene_id, image_id, category_id, score, bbox, segmentation, time
+  (https://bop.felk.cvut.cz/challenges/bop-challenge-2022/, 5.1).
+* CNOS, SAM-6D as npz: the same names, an array each; masks n × h × w
+  (https://github.com/nv-nguyen/cnos, src/model/utils.py).
+* COCO: results, or a data set with images and annotations (https://cocodataset.org/#format-data).
+* SAM: a list of segmentation, predicted_iou, stability_score
+  (https://github.com/facebookresearch/segment-anything, automatic_mask_generator.py).
+* Grounded-SAM: annotations with segmentation and score, img_width, img_height
+  (https://github.com/IDEA-Research/Grounded-SAM-2).
+"""
 
 import math
 from dataclasses import dataclass, field
