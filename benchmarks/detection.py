@@ -107,8 +107,10 @@ class Bench:
         known = []
         for obj_id, truth in truths.items():
             index = self.objects.index(obj_id)
-            mine, rejected = self.detector.seek(sight, index, diameter=self.models[obj_id].diameter)
-            found = self.detector.choose(sight, mine, rejected)
+            size = self.models[obj_id].diameter
+            alone_sight = self.detector.look(frame.rgb, frame.depth, frame.camera, diameter=size)
+            mine, rejected = self.detector.seek(alone_sight, index, diameter=size)
+            found = self.detector.choose(alone_sight, mine, rejected)
             known.append({"obj_id": obj_id, **self._judge(found, obj_id, truth)})
         wrong = [self._wrong_masks(frame, obj_id, truths) for obj_id in truths]
         return {

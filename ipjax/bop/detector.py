@@ -53,6 +53,20 @@ class DatasetDetector(DatasetEstimator):
         self.detector = Detector(loaded, encoder, config, detection=detection, crop=crop)
         self.notes = [*self.notes, "masks were not given but found"]
 
+    def with_config(self, config: Config) -> "DatasetDetector":
+        """The same objects, loaded anew, with another configuration."""
+        return DatasetDetector(
+            self.objects,
+            self.encoder,
+            config,
+            crop=self.crop,
+            seed=self.seed,
+            known_size=self.known_size,
+            detection=self.detection,
+            everything=self.everything,
+            folder=self.folder,
+        )
+
     def info(self, obj_id: int) -> ObjectInfo:
         """What is known of an object."""
         return self.detector.estimator.objects[self.numbers.index(obj_id)][1]

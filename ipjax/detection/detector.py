@@ -123,7 +123,9 @@ class Detector:
             raise ValueError(f"{count} objects and {len(diameters)} diameters")
         if not all(one is None or 0 < one < np.inf for one in diameters):
             raise ValueError(f"diameters are positive metres, or None, not {diameters}")
-        sight = self.look(rgb, depth, camera, depth_scale)
+        # Of one object, the frame is cut up by its size, too; the proposals of several are shared.
+        size = diameters[0] if count == 1 else None
+        sight = self.look(rgb, depth, camera, depth_scale, diameter=size)
         claims: list[Claim] = []
         rejected: list[Rejected] = []
         for index in bar(range(count), desc="detecting", unit=" objects", disable=not progress or count < 2):
@@ -132,15 +134,26 @@ class Detector:
             rejected += others
         return self.choose(sight, claims, rejected, instances=most)
 
-    def look(self, rgb: Any, depth: Any, camera: Any, depth_scale: float | None = None) -> Sight:
-        """The first part of `detect`, which no object has a part in: proposals, cut out and described.
+    def look(
+        self, rgb: Any, depth: Any, camera: Any, depth_scale: float | None = None, *, diameter: float | None = None
+    ) -> Sight:
+        """The first part of `detect`: proposals, cut out and described, of no object in particular.
 
-        Raises ValueError as `detect`.
+        Args:
+            rgb, depth, camera, depth_scale: as `detect` has them.
+            diameter: metres, of all that is sought, where it is known: pieces of that size are proposed, too, and none
+                that is much longer.
+
+        Raises:
+            ValueError: as `detect`.
         """
         scene = read_scene(rgb, depth, camera, depth_scale)
         watch = Stopwatch()
         with watch("propose"):
-            proposals = propose(scene.rgb, scene.depth, scene.matrix, self.proposals)
+            settings = ProposalConfig() if self.proposals is None else self.proposals
+            if diameter is not None:
+                settings = dataclasses.replace(settings, diameters=(diameter,))
+            proposals = propose(scene.rgb, scene.depth, scene.matrix, settings)
         with watch("cut"):
             crops = [cut_crop(scene, mask, **self.options) for mask in proposals.masks]
         signatures, used = None, np.zeros(0, int)

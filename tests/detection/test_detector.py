@@ -7,6 +7,7 @@ import pytest
 from builders.detections import HEIGHT, MATRIX, WIDTH, detector, ellipsoid, make_frame, place
 from builders.tiny_pipeline import assert_near
 
+from ipjax.cameras import unproject
 from ipjax.detection.assignment import overlap
 
 
@@ -64,6 +65,18 @@ def test_a_known_size_is_compared_with_the_size_that_is_told(monkeypatch):
     sight = sought.look(frame.rgb, frame.depth, MATRIX)
     free, right, wrong = (sought.seek(sight, 0, diameter=size)[0] for size in (None, 0.3, 0.2))
     assert right[0].value > 0.5 * free[0].value and wrong[0].value < 0.01 * free[0].value
+
+
+def test_of_a_known_size_nothing_longer_is_proposed():
+    frame, sought = make_frame(), detector()
+    free, sized = (sought.look(frame.rgb, frame.depth, MATRIX, diameter=size) for size in (None, 0.1))
+    points = unproject(MATRIX, np.indices((HEIGHT, WIDTH), float)[::-1].reshape(2, -1).T, frame.depth.reshape(-1))
+
+    def lengths(sight):
+        inside = [points[mask.reshape(-1) & (frame.depth.reshape(-1) > 0)] for mask in sight.proposals.masks]
+        return np.array([np.linalg.norm(np.quantile(p, 0.95, axis=0) - np.quantile(p, 0.05, axis=0)) for p in inside])
+
+    assert lengths(free).max() > 0.2 > 0.18 > lengths(sized).max()
 
 
 def test_frames_that_cannot_be_searched_are_refused_in_words():
