@@ -30,6 +30,7 @@ ORDER = [
     ["ipjax.onboarding"],
     ["ipjax.synthetic"],
     ["ipjax.bop"],
+    ["ipjax.capture"],
     ["ipjax.commands"],
     ["ipjax.cli"],
     ["ipjax.__main__"],
