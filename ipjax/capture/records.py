@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from ipjax.records import Camera
 from ipjax.transforms import Similarity
@@ -66,6 +66,25 @@ class Trajectory:
     source: str  # in words: "structure from motion", "given", "board", "refined"
     # Of rotation (rad) and translation (m) about the camera, along its axes, in that order; None = not known.
     covariance: Float[np.ndarray, "n 6 6"] | None = None
+    scale: float | None = None  # metres per unit of what the poses were found in, by depth; None = metric without it
+    agreement: float | None = None  # share of the depth's votes that agree on that scale; None = there was no vote
 
     def __len__(self) -> int:
         return len(self.names)
+
+
+@dataclasses.dataclass(frozen=True)
+class Tracks:
+    """Points of the scene that were recognised in several frames: one row an observation, sorted by track, then frame.
+
+    No frame sees a track twice, and every track is seen by two frames or more.
+    """
+
+    frame: Int[np.ndarray, " m"]  # index into the names of the capture
+    track: Int[np.ndarray, " m"]  # 0 … count − 1
+    pixel: Float[np.ndarray, "m 2"]  # (x, y), pixels of the colour image
+    depth: Float[np.ndarray, " m"]  # along z, metres, as the frame's depth image has it there; 0 = unknown
+    count: int  # of tracks
+
+    def __len__(self) -> int:
+        return self.count
