@@ -7,7 +7,7 @@ axes, with the first pixel's centre at (0, 0).
 
 import dataclasses
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -31,6 +31,7 @@ class CaptureFrame:
     usable: Bool[np.ndarray, "h w"]  # not hidden by what moves with the camera (gripper, hand)
 
 
+@runtime_checkable
 class ReadFrame(Protocol):
     """How a form of captures reads one of its frames."""
 
