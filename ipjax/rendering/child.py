@@ -90,7 +90,7 @@ def set_light(scene: mujoco.MjvScene, light: dict | None) -> None:
     lamp.attenuation[:] = (1, 0, 0)
     lamp.cutoff, lamp.exponent = 180, 0
     lamp.pos[:] = 0
-    lamp.dir[:] = (0, 0, 1) if light is None else light["direction"]
+    lamp.dir[:] = (0, 0, 1)
     lamp.ambient[:] = 1 if light is None else light["ambient"]
     lamp.diffuse[:] = 0 if light is None else light["diffuse"]
     lamp.specular[:] = 0
@@ -176,6 +176,8 @@ def main(folder: Path) -> None:
     segmenting = [mujoco.mjtRndFlag.mjRND_SEGMENT.value, mujoco.mjtRndFlag.mjRND_IDCOLOR.value]
     for frame in range(frames):
         set_camera(scene, frusta[frame])
+        if job["light"] is not None:
+            scene.lights[0].dir[:] = job["light"]["directions"][frame]
         shown = np.flatnonzero(poses[frame, :, :, :3].any((1, 2))).tolist()
         for slot, i in enumerate(shown):
             geom = scene.geoms[slot]

@@ -54,7 +54,8 @@ class Job:
     height: int  # pixels
     width: int
     oversample: int  # samples on a side of a pixel; odd
-    light: dict | None  # direction [3] in the camera frame, ambient, diffuse; None = unlit
+    # direction [3] in the camera frame, or one per frame [frame 3]; ambient, diffuse; None = unlit
+    light: dict | None
     segment: bool  # also render which mesh is at each pixel
 
     def __post_init__(self):
@@ -82,6 +83,13 @@ class Job:
 
         table = self.intrinsics
         return Camera(focal=jnp.asarray(table[:, :2], jnp.float32), centre=jnp.asarray(table[:, 2:], jnp.float32))
+
+    @property
+    def light_directions(self) -> np.ndarray:
+        """Unit vectors in the camera frame, [frame 3]: where the light of every frame goes; unlit ones look ahead."""
+        given = [0.0, 0.0, 1.0] if self.light is None else self.light["direction"]
+        direction = np.broadcast_to(np.asarray(given, np.float64), (len(self.poses), 3))
+        return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
     def near_far(self) -> np.ndarray:
         """Clipping distances that hold everything in front of the camera, [frame 2]."""

@@ -171,9 +171,8 @@ def _write_job(job: Job, folder: Path) -> None:
     np.save(folder / "frusta.npy", frusta)
     light = None
     if job.light is not None:
-        direction = np.asarray(job.light["direction"], np.float64)
         light = {
-            "direction": (direction / np.linalg.norm(direction)).tolist(),
+            "directions": job.light_directions.tolist(),
             "ambient": float(job.light.get("ambient", 0.5)),
             "diffuse": float(job.light.get("diffuse", 0.5)),
         }

@@ -55,8 +55,7 @@ def draw_raster(job: Job, progress: Callable[[int, int], None] | None) -> Render
                 pixels[mine] = np.einsum("kc,kci->ki", weight[mine], mesh.colours[local].astype(np.float64))
             if job.light is not None:
                 normals = np.einsum("kc,kci->ki", weight[mine], mesh.normals[local]) @ pose[i, :, :3].T
-                direction = np.asarray(job.light["direction"], np.float64)
-                direction = direction / np.linalg.norm(direction)
+                direction = job.light_directions[frame]
                 length = np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
                 shade = job.light.get("diffuse", 0.5) * np.maximum(-(normals @ direction) / length, 0)
                 pixels[mine] *= np.minimum(job.light.get("ambient", 0.5) + shade, 1)[:, None]

@@ -91,6 +91,38 @@ def render_scene(
     return _draw(job, backend, None)
 
 
+def render_frames(
+    objects: Sequence[tuple[Mesh, Similarity]],
+    camera: Camera,
+    height: int,
+    width: int,
+    *,
+    backend: str = "auto",
+    oversample: int = 3,
+    light: dict | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Renders:
+    """Several images of one scene: of each mesh its ``camera_from_object`` in every frame, [v], all of the same scale.
+
+    As `render_scene` otherwise; the light's direction may be one per frame, [v 3], each in its camera's frame: that of
+    a lamp that hangs in the world turns with the camera. `progress` is called as `progress(done, total)`.
+    """
+    if not objects:
+        raise ValueError("a scene needs at least one object")
+    meshes, poses = [], []
+    for mesh, camera_from_object in objects:
+        scale = np.asarray(camera_from_object.scale, np.float64).reshape(-1)
+        if np.ptp(scale) > 1e-6 * scale[0]:
+            raise ValueError("a mesh keeps its size from frame to frame")
+        meshes.append(dataclasses.replace(mesh, vertices=mesh.vertices * scale[0]))
+        rotation = np.asarray(camera_from_object.rotation, np.float64)
+        translation = np.asarray(camera_from_object.translation, np.float64)
+        poses.append(np.concatenate([rotation, translation[..., None]], axis=-1))
+    count = len(poses[0])
+    job = Job(meshes, np.stack(poses, axis=1), np.ones(count), camera, height, width, oversample, light, True)
+    return _draw(job, backend, progress)
+
+
 def render_each(
     meshes: Sequence[Mesh],
     which: Sequence[int],

@@ -5,21 +5,19 @@ diameter, like every normalised mesh; a scene gives each a size in metres.
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from scipy.spatial import ConvexHull
 
 from ipjax.cameras import middle, project, resize_pixels
-from ipjax.files.meshes.mesh import Mesh, make_mesh
+from ipjax.files.meshes.mesh import Mesh
 from ipjax.records import Camera, Similarity
 from ipjax.rendering.render import render_scene
-from ipjax.synthetic.objects import KINDS, face_areas, make_object
+from ipjax.synthetic.objects import KINDS
 from ipjax.synthetic.sensor import STRUCTURED_LIGHT, Sensor, expose, sense_depth
-from ipjax.synthetic.textures import TEXTURE, make_marble, make_palette
+from ipjax.synthetic.tables import make_clutter, make_room, place_on_table
 from ipjax.transforms import rotation_from_vector
 
 WIDTH, HEIGHT = 640, 480
@@ -76,14 +74,14 @@ def make_scene(
     rng = np.random.default_rng([seed, 11])
     drawn = rng.uniform(0.09, 0.22, len(objects) + clutter)
     cluttering = rng.choice(10 * len(KINDS), clutter, replace=False)
-    meshes = [*objects, *(_make_clutter(int(number)) for number in cluttering)]
+    meshes = [*objects, *(make_clutter(int(number)) for number in cluttering)]
     diameters = [*(drawn[: len(objects)] if sizes is None else sizes), *drawn[len(objects) :]]
-    world_from_object = _place_on_table(rng, meshes, diameters)
+    world_from_object = place_on_table(rng, meshes, diameters)
     camera = _draw_camera(rng)
     camera_from_world = _choose_view(rng, meshes, world_from_object, camera, least_visible)
 
     poses = [camera_from_world @ pose for pose in world_from_object]
-    room = [(mesh, camera_from_world.to_jax()) for mesh in _make_room(rng)]
+    room = [(mesh, camera_from_world.to_jax()) for mesh in make_room(rng)]
     down = camera_from_world.rotation @ np.array([0.0, 0, -1])
     light = {
         "direction": down + 0.7 * rng.normal(size=3) * [1, 1, 0.5],
@@ -108,67 +106,10 @@ def make_scene(
     )
 
 
-@functools.lru_cache(maxsize=10 * len(KINDS))
-def _make_clutter(number: int) -> Mesh:
-    """One of a fixed set of objects, made once for many scenes; from seeds that no caller's object has."""
-    return make_object(KINDS[number % len(KINDS)], 10**9 + number)
-
-
 def _draw_camera(rng: np.random.Generator) -> Camera:
     focal = rng.uniform(520, 640) * np.array([1, rng.uniform(0.99, 1.01)])
     centre = middle(WIDTH, HEIGHT) + rng.normal(0, 6, 2)
     return Camera(focal=jnp.asarray(focal, jnp.float32), centre=jnp.asarray(centre, jnp.float32))
-
-
-def _rotate_onto(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The shortest rotation that takes one unit vector to another."""
-    axis, cosine = np.cross(first, second), float(first @ second)
-    if cosine < -0.999999:
-        other = np.eye(3)[np.abs(first).argmin()]
-        half = np.cross(first, other)
-        half /= np.linalg.norm(half)
-        return 2 * np.outer(half, half) - np.eye(3)
-    skew = np.cross(np.eye(3), -axis)
-    return np.eye(3) + skew + skew @ skew / (1 + cosine)
-
-
-def _place_on_table(
-    rng: np.random.Generator, meshes: Sequence[Mesh], diameters: Sequence[float]
-) -> list[Similarity[np.ndarray]]:
-    """``world_from_object``: every mesh rests on a face of its hull, the larger the likelier, apart from others."""
-    poses, taken = [], []
-    for mesh, diameter in zip(meshes, diameters, strict=True):
-        hull = ConvexHull(mesh.vertices)
-        area = face_areas(hull.points, hull.simplices)
-        side = rng.choice(len(area), p=area / area.sum())
-        angle = rng.uniform(0, 2 * np.pi)
-        rotation = _rotate_onto(hull.equations[side, :3], np.array([0.0, 0, -1]))
-        rotation = rotation_from_vector(np.array([0, 0, angle])) @ rotation
-        corners = diameter * hull.points[hull.vertices] @ rotation.T
-        shadow = corners[ConvexHull(corners[:, :2]).vertices, :2]
-        offset = rng.uniform(-0.02, 0.02, 2)
-        for attempt in range(200):
-            if all(_are_apart(shadow + offset, other) for other in taken):
-                break
-            reach = 0.11 + 0.0022 * attempt  # as near as there is room
-            offset = rng.uniform(-reach, reach, 2)
-        taken.append(shadow + offset)
-        translation = np.array([*offset, -corners[:, 2].min()])
-        poses.append(Similarity(rotation, translation, np.asarray(diameter, np.float64)))
-    return poses
-
-
-def _are_apart(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether a line separates two convex polygons, with 4 mm to spare."""
-    for polygon in (first, second):
-        edges = np.roll(polygon, -1, 0) - polygon
-        normals = np.stack([edges[:, 1], -edges[:, 0]], -1) / np.maximum(
-            np.linalg.norm(edges, axis=-1, keepdims=True), 1e-9
-        )
-        a, b = first @ normals.T, second @ normals.T
-        if ((a.min(0) - b.max(0) > 0.004) | (b.min(0) - a.max(0) > 0.004)).any():
-            return True
-    return False
 
 
 def _choose_view(
@@ -240,27 +181,3 @@ def _outline_area(mesh: Mesh, camera_from_object: Similarity[np.ndarray], camera
     for triangle in fixed[mesh.faces]:
         cv2.fillConvexPoly(canvas, triangle, 1, shift=4)
     return int(canvas.sum())
-
-
-def _make_room(rng: np.random.Generator) -> list[Mesh]:
-    """A table top about the origin, and the floor and walls around it."""
-    # Duller than the objects, and of any brightness.
-    first, second = (0.35 * make_palette(rng, 2) + 0.65 * rng.uniform(30, 235, (2, 1))).clip(0, 255)
-    grain = make_marble(rng, TEXTURE, first, first * rng.uniform(0.6, 0.95))
-    if rng.uniform() < 0.4:
-        grain[:] = grain[:, :1]  # wood
-    grain = grain + rng.normal(0, rng.uniform(1, 8), grain.shape)
-    table = np.array([[-0.6, -0.45, 0], [0.6, -0.45, 0], [0.6, 0.45, 0], [-0.6, 0.45, 0]])
-    square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    two = np.array([[0, 1, 2], [0, 2, 3]])
-    wall = make_marble(rng, TEXTURE, second, second * rng.uniform(0.7, 1.0)) + rng.normal(0, 4, (TEXTURE, TEXTURE, 1))
-    r, low, high = 2.2, -0.75, 1.8
-    a, b, c, d = [-r, -r], [r, -r], [r, r], [-r, r]
-    quads = [[[*p, low], [*q, low], [*q, high], [*p, high]] for p, q in ((b, a), (c, b), (d, c), (a, d))]
-    quads.append([[*p, low] for p in (a, b, c, d)])
-    corners = np.array(quads, float).reshape(-1, 3)
-    faces = np.concatenate([two + 4 * k for k in range(len(quads))])
-    return [
-        make_mesh(table, two, uv=square, texture=np.clip(grain, 0, 255).astype(np.uint8)),
-        make_mesh(corners, faces, uv=np.tile(square, (len(quads), 1)), texture=np.clip(wall, 0, 255).astype(np.uint8)),
-    ]
