@@ -43,7 +43,7 @@ class Capture:
     """A capture on disc. Its frames are read when asked for."""
 
     folder: Path
-    form: str  # "frames", "tum", "bop": the layout that was recognised
+    form: str  # "frames", "tum", "numbered", "bop": the layout that was recognised
     names: tuple[str, ...]  # of the frames, in the order of the capture
     camera: Camera  # of the colour images, without distortion
     size: tuple[int, int]  # of the colour images: width, height, pixels
@@ -52,6 +52,7 @@ class Capture:
     depth_size: tuple[int, int] | None = None  # of the raw depth images: width, height, pixels
     colour_from_depth: Similarity[np.ndarray] | None = None  # the factory's, rigid; None = not known
     world_from_camera: Similarity[np.ndarray] | None = None  # of every frame, rigid, where poses were given
+    notes: tuple[str, ...] = ()  # what the reader decided or left out, a sentence each
 
     def __len__(self) -> int:
         return len(self.names)

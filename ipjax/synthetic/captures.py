@@ -64,9 +64,9 @@ def make_capture(
     touching: int = 0,
     size: tuple[int, int] = (640, 480),
     depth_size: tuple[int, int] | None = None,
-    arc: float = 360.0,
+    arc: float | int = 360,
     sensor: Sensor = STRUCTURED_LIGHT,
-    factory_error: float = 1.0,
+    factory_error: float | int = 1,
     gripper: bool = False,
     oversample: int = 1,
     backend: str = "auto",
@@ -110,7 +110,7 @@ def make_capture(
     world_from_camera = _draw_path(rng, views, arc)
     camera, depth_camera, colour_from_depth = _draw_rig(rng, size, depth_size or _shrink(size))
     depth_size = depth_size or _shrink(size)
-    light = {"ambient": float(rng.uniform(0.45, 0.6)), "diffuse": float(rng.uniform(0.45, 0.6))}
+    light = {"ambient": float(rng.uniform(0.5, 0.65)), "diffuse": float(rng.uniform(0.45, 0.6))}
     down = np.array([0.0, 0, -1]) + 0.6 * rng.normal(size=3) * [1, 1, 0.3]  # where the light goes, in the world
 
     world_from = [(mesh, pose) for mesh, pose in zip(objects, placed, strict=True)]
@@ -240,7 +240,7 @@ def _draw_rig(
     return cameras[0], cameras[1], Similarity(turn, beside, np.ones(()))
 
 
-def _draw_path(rng: np.random.Generator, views: int, arc: float) -> Similarity[np.ndarray]:
+def _draw_path(rng: np.random.Generator, views: int, arc: float | int) -> Similarity[np.ndarray]:
     """``world_from_camera`` of a hand that carries the camera around the table, [v]."""
     share = np.arange(views) / (views if arc >= 360 else max(views - 1, 1))
     step = np.deg2rad(arc) / views
