@@ -61,7 +61,7 @@ def test_light_stays_where_it_hangs(capture):
 def test_objects_are_where_the_truth_has_them(capture):
     for index, mesh in enumerate(capture.meshes):
         pose = at(capture.world_from_object, index)
-        points, rows, columns = lift(capture.camera, np.where(capture.ids[1] == index, capture.true_depth[1], 0))
+        points, _, _ = lift(capture.camera, np.where(capture.ids[1] == index, capture.true_depth[1], 0))
         assert len(points) > 100
         inside = pose.inverse() @ (at(capture.world_from_camera, 1) @ points)
         near = np.concatenate([mesh.vertices, mesh.vertices[mesh.faces].mean(1)])
