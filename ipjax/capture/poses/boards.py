@@ -89,8 +89,8 @@ def find_by_board(capture: Capture, board: Board, progress: Any = None) -> Traje
     if registered.sum() < max(2, count / 2):
         lost = [name for name, known in zip(capture.names, registered, strict=True) if not known]
         raise CaptureError(
-            f"the board was found in {int(registered.sum())} of {count} frames, not in {tell_names(lost)}: are its kind, "
-            "squares and dictionary as they were given?"
+            f"the board was found in {int(registered.sum())} of {count} frames, not in {tell_names(lost)}: are its "
+            "kind, squares and dictionary as they were given?"
         )
     return Trajectory(capture.names, Similarity(rotation, translation, np.ones(count)), registered, "board")
 

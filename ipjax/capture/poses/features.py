@@ -224,8 +224,9 @@ def find_still(
 ) -> Bool[np.ndarray, "h w"]:
     """Where in the image something moves with the camera (a gripper, a hand): it stays while the scene moves on.
 
-    Only pairs of frames count in which much else has moved far. Of a camera that circles about a point the neighbourhood
-    of that point stays, too, but it is as small as `STILL` over the turn between such frames; what is found is larger.
+    Only pairs of frames count in which much else has moved far. Of a camera that circles about a point the
+    neighbourhood of that point stays, too, but it is as small as `STILL` over the turn between such frames; what is
+    found is larger.
 
     Args:
       features: of each frame.

@@ -48,8 +48,8 @@ def check_given(trajectory: Trajectory, tracks: Tracks, K: Float[np.ndarray, "3 
     if share >= LEAST_SHARE:
         if abs(scale - 1) > WITHIN:
             raise CaptureError(
-                f"the poses that are given are not in metres: by the depth, their unit is {scale:.4g} m (or the depth's "
-                "unit is wrong: see depth_scale)"
+                f"the poses that are given are not in metres: by the depth, their unit is {scale:.4g} m (or the "
+                "depth's unit is wrong: see depth_scale)"
             )
         return Trajectory(trajectory.names, trajectory.world_from_camera, trajectory.registered, trajectory.source,
                           trajectory.covariance, 1.0, share)  # fmt: skip

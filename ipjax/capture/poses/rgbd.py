@@ -55,8 +55,8 @@ def find_by_depth(
     if found is None or found.share < LEAST_SHARE:
         share = 0 if found is None else found.share
         raise CaptureError(
-            f"the poses found are wrong: only {100 * share:.0f} % of the measured depths agree with them; something may "
-            "move with the camera (hide it with ignore.png), or the depth may not belong to the colours"
+            f"the poses found are wrong: only {100 * share:.0f} % of the measured depths agree with them; something "
+            "may move with the camera (hide it with ignore.png), or the depth may not belong to the colours"
         )
     rotation = np.where(registered[:, None, None], poses.rotation, np.eye(3))
     translation = np.where(registered[:, None], poses.translation, 0)

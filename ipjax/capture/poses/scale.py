@@ -1,4 +1,4 @@
-"""The metric scale of a reconstruction: every observed point whose depth was measured votes for measured over own depth.
+"""The metric scale of a reconstruction: every observed point with a measured depth votes for measured over own depth.
 
 A wrong reconstruction shows here: its depths are not those that were measured, whatever the scale, and the votes
 scatter. That refuses what no residual of its own would.
@@ -74,9 +74,9 @@ def make_metric(names: Sequence[str], structure: Structure) -> tuple[Trajectory,
         )
     if found.share < LEAST_SHARE:
         raise CaptureError(
-            f"the reconstruction is wrong: of {found.votes} measured depths only {100 * found.share:.0f} % agree on its "
-            "scale; something may move with the camera (hide it with ignore.png), or the depth may not belong to the "
-            "colours"
+            f"the reconstruction is wrong: of {found.votes} measured depths only {100 * found.share:.0f} % agree on "
+            "its scale; something may move with the camera (hide it with ignore.png), or the depth may not belong to "
+            "the colours"
         )
     registered = structure.registered.copy()
     for index in np.flatnonzero(registered):
