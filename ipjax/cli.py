@@ -14,12 +14,23 @@ import warnings
 from collections.abc import Sequence
 
 from ipjax import __version__
-from ipjax.commands import degrade, demo, doctor, estimate, evaluate, export, onboard, score, weights
+from ipjax.commands import capture, degrade, demo, doctor, estimate, evaluate, export, onboard, score, weights
 from ipjax.commands.interface import completion
 from ipjax.commands.interface.messages import Messages, in_one_line, is_user_error
 from ipjax.commands.interface.parser import Parser
 
-_COMMANDS = (onboard, estimate, demo, doctor, weights, score, evaluate, degrade, export)  # as --help lists them
+_COMMANDS = (
+    onboard,
+    estimate,
+    demo,
+    doctor,
+    weights,
+    score,
+    evaluate,
+    capture,
+    degrade,
+    export,
+)  # as --help lists them
 GUIDE = """\
 start here:
   ipjax doctor                               what works on this machine

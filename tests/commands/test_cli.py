@@ -18,7 +18,18 @@ def test_debug_shows_the_traceback(case, monkeypatch):
         cli.main(estimate_words(case, rgb="none.png"))
 
 
-COMMANDS = ("onboard", "estimate", "demo", "doctor", "weights", "score", "evaluate", "degrade", "export")
+COMMANDS = (
+    "onboard",
+    "estimate",
+    "demo",
+    "doctor",
+    "weights",
+    "score",
+    "evaluate",
+    "capture",
+    "degrade",
+    "export",
+)
 
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
@@ -29,7 +40,8 @@ def test_help_teaches_by_examples(name, capfd):
 
 
 @pytest.mark.parametrize(
-    "words", ["--version", "--help", *(f"{name} --help" for name in COMMANDS), "weights fetch --help"]
+    "words",
+    ["--version", "--help", *(f"{name} --help" for name in COMMANDS), "weights fetch --help", "capture pose --help"],
 )
 def test_help_and_version_load_nothing_but_the_command(words):
     """A count, for time would depend on the machine: 97 modules where there once were 897."""

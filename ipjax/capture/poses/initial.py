@@ -47,8 +47,8 @@ def find_poses(
 
     Args:
       method: "given", "board", "structure" (motion, by pycolmap), "depth" (features and depth, without pycolmap), or
-        "auto": by the board, if one is described; as given, if they are; else by structure from motion, if pycolmap is
-        installed; else, or if that fails, by features and depth.
+        "auto": by the board, if one is described; as given, if they are; else by features and depth; and by structure
+        from motion, if pycolmap is installed, where that fails or leaves frames out.
       board: what lies in the scene, for "board".
       find_gripper: leave out what moves with the camera.
       seed: same seed, same poses.
@@ -78,8 +78,7 @@ def find_poses(
         assert board is not None
         trajectory = find_by_board(capture, board, lambda done, total: say("board", done, total))
     else:
-        trajectory, more = _find(capture, features, matches, method, seed)
-        notes += more
+        trajectory = _find(capture, features, matches, method, seed)
     tracks = clean(tracks, trajectory, K)
     points, told = triangulate(tracks, trajectory.world_from_camera, K, trajectory.registered)
     off, own = reproject(tracks, points, trajectory.world_from_camera, K)
@@ -92,21 +91,36 @@ def find_poses(
 
 def _find(
     capture: Capture, features: Sequence[Features], matches: Sequence[Match], method: Method, seed: int
-) -> tuple[Trajectory, list[str]]:
-    """From features alone, or with their depth; the poses begin at the first frame that has one."""
+) -> Trajectory:
+    """From features and their depth, or from features alone; the poses begin at the first frame that has one.
+
+    With their depth is the surer and the more exact where all is well (benchmarks/results/captures.md); without it
+    frames come in whose depth has holes where their features are.
+    """
     names, K = capture.names, capture.camera.to_matrix()
     if not any((one.depth > 0).any() for one in features):
         raise CaptureError(f"{capture.folder}: no feature has a measured depth, so nothing tells the scale")
-    notes = []
-    if method == "structure" or (method == "auto" and structure.is_available()):
+    ways: dict[str, Callable[[], Trajectory]] = {
+        "depth": lambda: rgbd.find_by_depth(names, features, matches, K),
+        "structure": lambda: make_metric(
+            names, structure.map_incrementally(names, features, matches, K, capture.size, seed=seed)
+        )[0],
+    }
+    if method != "auto":
+        return _begin_at_first(ways[method]())
+    found: list[Trajectory] = []
+    reasons: list[str] = []
+    for name in ("depth", "structure"):
+        if name == "structure" and (not structure.is_available() or (found and found[0].registered.all())):
+            continue
         try:
-            found = structure.map_incrementally(names, features, matches, K, capture.size, seed=seed)
-            return _begin_at_first(make_metric(names, found)[0]), notes
+            found.append(ways[name]())
         except CaptureError as error:
-            if method == "structure":
-                raise
-            notes.append(f"structure from motion failed ({error}); features and depth were taken instead")
-    return _begin_at_first(rgbd.find_by_depth(names, features, matches, K)), notes
+            reasons.append(str(error))
+    if not found:
+        hint = "" if structure.is_available() else f" (another way is at hand: {structure.MISSING})"
+        raise CaptureError(reasons[0] + hint)
+    return _begin_at_first(max(found, key=lambda one: int(one.registered.sum())))
 
 
 def _begin_at_first(trajectory: Trajectory) -> Trajectory:

@@ -1,0 +1,25 @@
+"""``ipjax capture``: from a capture of a scene to a data set, a step a file."""
+
+from typing import Any
+
+from ipjax.commands.capture import pose
+from ipjax.commands.interface.parser import Parser, add_command
+
+STEPS = (pose,)  # as --help lists them
+EXAMPLES = """\
+examples:
+  ipjax capture pose table/ -o work/       where the camera stood, frame by frame: work/poses.json
+
+A capture is a folder of frames: rgb/NAME.png, depth/NAME.png (registered to the colours), camera.json, and, if they are
+known, poses.json and ignore.png (non-zero = moves with the camera); a TUM RGB-D sequence; or a scene of a BOP data set.
+"""
+
+
+def add(commands: Any) -> None:
+    """The command and its steps."""
+    parser = add_command(
+        commands, "capture", None, "make a data set of a hand-held RGB-D capture, step by step", EXAMPLES
+    )
+    steps = parser.add_subparsers(title="steps", metavar="STEP", required=True, parser_class=Parser)
+    for step in STEPS:
+        step.add(steps)

@@ -1,0 +1,32 @@
+"""The options by which every step is told its capture."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from ipjax.commands.interface.parser import parse_camera, parse_count
+
+FORMS = ("frames", "tum", "numbered", "bop")
+
+
+def add_capture(parser: Any) -> None:
+    """The folder, and what it does not say itself."""
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="the capture")
+    parser.add_argument("--form", choices=FORMS, help="its form, where the folder does not show it")
+    parser.add_argument("--camera", metavar="FILE|fx,fy,cx,cy", help="of the colours (default: the folder's own)")
+    parser.add_argument("--depth-scale", type=float, metavar="X", help="metres per number of the depth images")
+    parser.add_argument("--every", type=parse_count, default=1, metavar="N", help="take each N-th frame only")
+
+
+def open_given(arguments: argparse.Namespace, *, poses: bool = True) -> Any:
+    """The capture that the options of `add_capture` name. Raises CaptureError in one sentence."""
+    from ipjax.capture.reading.opening import open_capture
+
+    return open_capture(
+        arguments.folder,
+        form=arguments.form,
+        camera=None if arguments.camera is None else parse_camera(arguments.camera),
+        depth_scale=arguments.depth_scale,
+        poses=poses,
+        every=arguments.every,
+    )
