@@ -63,10 +63,12 @@ def parse_board(text: str) -> Board:
     board = Board(kind, int(columns), int(rows), float(length), float(other), dictionary)
     if not 0 < board.length < 2 or board.other <= 0 or (kind == "charuco" and board.other >= board.length):
         raise CaptureError(f"{text!r}: lengths are in metres, and a marker is smaller than its square")
-    try:
-        board.make()
-    except cv2.error:
-        raise CaptureError(f"{text!r}: OpenCV makes no such board; has the dictionary enough markers?") from None
+    needed = board.columns * board.rows // (2 if kind == "charuco" else 1)
+    there = len(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).bytesList)
+    if needed > there:
+        raise CaptureError(f"{text!r}: the dictionary has {there} markers, and the board takes {needed}")
+    if min(board.columns, board.rows) < 2:
+        raise CaptureError(f"{text!r}: a board has two rows and two columns or more")
     return board
 
 

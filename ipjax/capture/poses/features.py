@@ -257,7 +257,10 @@ def find_still(
         here = np.zeros((height, width), bool)
         here[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)] = True
         votes += np.asarray(ndimage.binary_dilation(here, iterations=4))
-    labels, _ = ndimage.label(votes >= max(3, 0.2 * len(features)))
+    # Padded, so that what reaches the border stays there; closed, because between its points it is there, too.
+    seen_often = np.pad(votes >= max(3, 0.2 * len(features)), 24)
+    closed = np.asarray(ndimage.binary_closing(seen_often, iterations=24))[24:-24, 24:-24]
+    labels, _ = ndimage.label(closed)
     mask = np.zeros((height, width), bool)
     for index, (rows, columns) in enumerate(ndimage.find_objects(labels), start=1):
         if max(rows.stop - rows.start, columns.stop - columns.start) >= 30:
