@@ -6,6 +6,7 @@ the tree of the best pairs, and then everything adjusted at once: pixels and mea
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -20,6 +21,7 @@ from ipjax.transforms import Similarity, rotation_from_vector
 SOURCE = "features and depth"
 PIXELS = 1.0  # standard deviation of a feature's place
 DEPTH = 0.01  # of a measured depth, as a share of it
+LEAST_KEPT = 0.3  # of a frame's observations that must agree with its pose
 _WIDTHS = (10.0, 5.0, 3.0)  # of the robust loss, standard deviations, from coarse to fine
 
 
@@ -44,16 +46,18 @@ def find_by_depth(
     edges = [edge for found in matches if (edge := _relate(found, features, K)) is not None]
     poses, registered = _span(edges, len(names))
     check_registered(names, registered)
-    tracks = _only(join(features, matches), registered)
-    poses, tracks = adjust(poses, tracks, K)
-    seen = np.bincount(tracks.frame, minlength=len(names))
-    registered &= seen >= FEWEST
+    joined = _only(join(features, matches), registered)
+    poses, tracks = adjust(poses, joined, K)
+    before, after = (np.bincount(x.frame, minlength=len(names)) for x in (joined, tracks))
+    registered &= (after >= FEWEST) & (after > LEAST_KEPT * before)
     check_registered(names, registered)
     points, told = triangulate(tracks, poses, K, registered)
     _, own = reproject(tracks, points, poses, K)
-    found = vote(np.where(told[tracks.track], tracks.depth, 0), own)
-    if found is None or found.share < LEAST_SHARE:
-        share = 0 if found is None else found.share
+    found = vote(np.where(told[tracks.track] & registered[tracks.frame], tracks.depth, 0), own)
+    # Of all that was measured, not of what was left in because it agrees.
+    asked = int(((joined.depth > 0) & registered[joined.frame]).sum())
+    share = 0.0 if found is None else float(found.agreeing.sum() / asked)
+    if share < LEAST_SHARE:
         raise CaptureError(
             f"the poses found are wrong: only {100 * share:.0f} % of the measured depths agree with them; something "
             "may move with the camera (hide it with ignore.png), or the depth may not belong to the colours"
@@ -61,7 +65,7 @@ def find_by_depth(
     rotation = np.where(registered[:, None, None], poses.rotation, np.eye(3))
     translation = np.where(registered[:, None], poses.translation, 0)
     known = Similarity(rotation, translation, np.ones(len(names)))
-    return Trajectory(tuple(names), known, registered, SOURCE, scale=1.0, agreement=found.share)
+    return Trajectory(tuple(names), known, registered, SOURCE, scale=1.0, agreement=share)
 
 
 def _relate(found: Match, features: Sequence[Features], K: Float[np.ndarray, "3 3"]) -> Edge | None:
@@ -121,6 +125,9 @@ def adjust(
 ) -> tuple[Similarity[np.ndarray], Tracks]:
     """Bundle adjustment of pixels and measured depths, robust; after each round what stays far off is left out.
 
+    A shift that all measured depths share (the factory is wrong about where the depth camera stands) is not sought: of
+    made captures the features alone told it no better than to 3 mm, which is what it is.
+
     Args:
       poses: world_from_camera of all frames; those that see no track stay as they are.
 
@@ -128,21 +135,28 @@ def adjust(
       The poses; and the tracks that agree with them.
     """
     for width in _WIDTHS:
-        points = _lift(poses, tracks, K)
-        tracks, points = _agreeing(poses, points, tracks, K, 2 * width)
-        poses, points = _descend(poses, points, tracks, K, width, steps)
-    return poses, _agreeing(poses, points, tracks, K, _WIDTHS[-1])[0]
+        tracks, points = _agreeing(_State(poses, _lift(poses, tracks, K)), tracks, K, 2 * width)
+        if not tracks.count:
+            break
+        poses, points = _descend(_State(poses, points), tracks, K, width, steps)
+        tracks, _ = _agreeing(_State(poses, points), tracks, K, width)
+    return poses, tracks
 
 
-def _agreeing(
-    poses: Similarity[np.ndarray], points: np.ndarray, tracks: Tracks, K: np.ndarray, within: float
-) -> tuple[Tracks, np.ndarray]:
+class _State(NamedTuple):
+    """What is adjusted."""
+
+    poses: Similarity[np.ndarray]
+    points: np.ndarray
+
+
+def _agreeing(state: _State, tracks: Tracks, K: np.ndarray, within: float) -> tuple[Tracks, np.ndarray]:
     """The observations that are off by so many standard deviations at most, and their points."""
-    off, depth_off = _misfit(poses, points, tracks, K)
+    off, depth_off = _misfit(state, tracks, K)
     kept = (off < within) & (depth_off < within)
     left = collect(tracks.frame[kept], tracks.track[kept], tracks.pixel[kept], tracks.depth[kept])
     numbers, counts = np.unique(tracks.track[kept], return_counts=True)
-    return left, points[numbers[counts > 1]]
+    return left, state.points[numbers[counts > 1]]
 
 
 def _lift(poses: Similarity[np.ndarray], tracks: Tracks, K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "c 3"]:
@@ -163,104 +177,93 @@ def _runs(tracks: Tracks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return np.arange(tracks.count), start, np.append(start[1:], len(tracks.track))
 
 
-def _locate(poses: Similarity[np.ndarray], points: np.ndarray, tracks: Tracks) -> Float[np.ndarray, "m 3"]:
+def _locate(state: _State, tracks: Tracks) -> Float[np.ndarray, "m 3"]:
     """Each observed point in its camera."""
-    arms = points[tracks.track] - poses.translation[tracks.frame]
-    return np.einsum("mji,mj->mi", poses.rotation[tracks.frame], arms)
+    arms = state.points[tracks.track] - state.poses.translation[tracks.frame]
+    return np.einsum("mji,mj->mi", state.poses.rotation[tracks.frame], arms)
 
 
-def _misfit(
-    poses: Similarity[np.ndarray], points: np.ndarray, tracks: Tracks, K: np.ndarray
-) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+def _misfit(state: _State, tracks: Tracks, K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of each observation how far pixel and depth are off, in standard deviations; a depth that is unknown is not."""
-    local = _locate(poses, points, tracks)
+    local = _locate(state, tracks)
     off = np.linalg.norm(project(K, local) - tracks.pixel, axis=1) / PIXELS
     known = tracks.depth > 0
     depth_off = np.abs(local[:, 2] - tracks.depth) / (DEPTH * np.where(known, tracks.depth, 1))
     return np.where(local[:, 2] > 1e-6, off, np.inf), np.where(known, depth_off, 0)
 
 
-def _descend(
-    poses: Similarity[np.ndarray], points: np.ndarray, tracks: Tracks, K: np.ndarray, width: float, steps: int
-) -> tuple[Similarity[np.ndarray], np.ndarray]:
+def _descend(state: _State, tracks: Tracks, K: np.ndarray, width: float, steps: int) -> _State:
     """Levenberg–Marquardt with the points eliminated (Schur complement); Cauchy's loss of this width."""
 
-    def loss(poses: Similarity[np.ndarray], points: np.ndarray) -> float:
-        off, depth_off = _misfit(poses, points, tracks, K)
-        return float(sum(np.log1p((np.minimum(x, 1e6) / width) ** 2).sum() for x in (off, depth_off)))
+    def loss(state: _State) -> float:
+        return float(sum(np.log1p((np.minimum(x, 1e6) / width) ** 2).sum() for x in _misfit(state, tracks, K)))
 
-    here, damping = loss(poses, points), 1e-3
+    here, damping = loss(state), 1e-3
     for _ in range(steps):
-        move, shift = _solve(poses, points, tracks, K, width, damping)
-        turned = rotation_from_vector(move[:, :3])  # of camera_from_world, on its left
-        rotation = poses.rotation @ np.swapaxes(turned, -1, -2)
-        new = Similarity(
-            rotation, poses.translation - np.einsum("nij,nj->ni", rotation, move[:, 3:]), np.ones(len(move))
-        )
-        there = loss(new, points + shift)
+        move, shift = _solve(state, tracks, K, width, damping)
+        # Of camera_from_world, on its left.
+        rotation = state.poses.rotation @ np.swapaxes(rotation_from_vector(move[:, :3]), -1, -2)
+        places = state.poses.translation - np.einsum("nij,nj->ni", rotation, move[:, 3:])
+        new = _State(Similarity(rotation, places, np.ones(len(move))), state.points + shift)
+        there = loss(new)
         if there < here:
             done = here - there < 1e-5 * here
-            poses, points, here, damping = new, points + shift, there, max(damping / 5, 1e-7)
+            state, here, damping = new, there, max(damping / 5, 1e-7)
             if done:
                 break
         else:
             damping *= 10
-    return poses, points
+    return state
 
 
 def _solve(
-    poses: Similarity[np.ndarray], points: np.ndarray, tracks: Tracks, K: np.ndarray, width: float, damping: float
+    state: _State, tracks: Tracks, K: np.ndarray, width: float, damping: float
 ) -> tuple[Float[np.ndarray, "n 6"], Float[np.ndarray, "c 3"]]:
     """One step: of each camera_from_world (turn, shift), and of each point."""
     from scipy import sparse
 
-    count = len(poses.scale)
-    local = _locate(poses, points, tracks)
+    count, seen = len(state.poses.scale), len(tracks.frame)
+    local = _locate(state, tracks)
     z = np.maximum(local[:, 2], 1e-6)
     known = tracks.depth > 0
     sigma = DEPTH * np.where(known, tracks.depth, 1)
     # Three residuals of each observation, and their slopes in its place in the camera.
-    residual = np.concatenate(
-        [(project(K, local) - tracks.pixel) / PIXELS, ((z - tracks.depth) / sigma)[:, None]], axis=1
-    )
-    off, depth_off = _misfit(poses, points, tracks, K)
+    depth_off = (z - tracks.depth) / sigma
+    residual = np.concatenate([(project(K, local) - tracks.pixel) / PIXELS, depth_off[:, None]], axis=1)
+    off, depth_off = _misfit(state, tracks, K)
     weight = 1 / (1 + (np.stack([off, off, depth_off], axis=1) / width) ** 2)
     weight[:, 2] *= known
-    slope = np.zeros((len(z), 3, 3))
+    slope = np.zeros((seen, 3, 3))
     slope[:, 0, 0], slope[:, 1, 1] = K[0, 0] / z / PIXELS, K[1, 1] / z / PIXELS
     slope[:, :2, 2] = -slope[:, [0, 1], [0, 1]] * local[:, :2] / z[:, None]
     slope[:, 2, 2] = 1 / sigma
-    cross = np.zeros((len(z), 3, 3))  # of a turn: turn × place
-    cross[:, [0, 1, 2], [1, 2, 0]], cross[:, [1, 2, 0], [0, 1, 2]] = (
-        local[:, [2, 0, 1]],
-        -local[:, [2, 0, 1]],
-    )
+    cross = np.zeros((seen, 3, 3))  # of a turn: turn × place
+    cross[:, [0, 1, 2], [1, 2, 0]], cross[:, [1, 2, 0], [0, 1, 2]] = local[:, [2, 0, 1]], -local[:, [2, 0, 1]]
     of_camera = np.concatenate([slope @ cross, slope], axis=2)  # m × 3 × 6
-    of_point = slope @ np.swapaxes(poses.rotation[tracks.frame], -1, -2)
-    weighted = weight[..., None] * of_camera
-    blocks, right = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    for index in range(count):
-        mine = tracks.frame == index
-        blocks[index] = weighted[mine].reshape(-1, 6).T @ of_camera[mine].reshape(-1, 6)
-        right[index] = weighted[mine].reshape(-1, 6).T @ residual[mine].reshape(-1)
-    _, start, _ = _runs(tracks)
-    point_weighted = np.swapaxes(weight[..., None] * of_point, -1, -2)
-    point_blocks = np.add.reduceat(point_weighted @ of_point, start)
-    point_right = np.add.reduceat((point_weighted @ residual[..., None])[..., 0], start)
-    for some in (blocks, point_blocks):
-        diagonal = np.einsum("nii->ni", some)  # a view
+    of_point = slope @ np.swapaxes(state.poses.rotation[tracks.frame], -1, -2)
+
+    rows = 3 * np.arange(seen)[:, None, None] + np.arange(3)[:, None]
+    camera_columns = 6 * tracks.frame[:, None] + np.arange(6)
+    point_columns = 3 * tracks.track[:, None] + np.arange(3)
+
+    def spread(blocks: np.ndarray, columns: np.ndarray, width: int) -> Any:
+        at = np.broadcast_to(rows, blocks.shape), np.broadcast_to(columns[:, None], blocks.shape)
+        return sparse.csr_matrix((blocks.reshape(-1), tuple(x.reshape(-1) for x in at)), (3 * seen, width))
+
+    cameras = spread(of_camera, camera_columns, 6 * count)
+    points = spread(of_point, point_columns, 3 * tracks.count)
+    weighted = cameras.T @ sparse.diags(weight.reshape(-1))
+    system, across = (weighted @ cameras).toarray(), (weighted @ points).tocsr()
+    right = weighted @ residual.reshape(-1)
+    start = np.searchsorted(tracks.track, np.arange(tracks.count))
+    turned = np.swapaxes(weight[..., None] * of_point, -1, -2)
+    blocks = np.add.reduceat(turned @ of_point, start)
+    point_right = np.add.reduceat((turned @ residual[..., None])[..., 0], start)
+    for diagonal in (np.einsum("ii->i", system), np.einsum("nii->ni", blocks)):  # views
         diagonal += damping * diagonal + 1e-9 * diagonal.max() + 1e-12
-    inverse = np.linalg.inv(point_blocks)
-    mixed = np.swapaxes(weighted, -1, -2) @ of_point  # m × 6 × 3
-    rows = (6 * tracks.frame[:, None, None] + np.arange(6)[:, None] + np.zeros((1, 1, 3), int)).reshape(-1)
-    columns = (3 * tracks.track[:, None, None] + np.arange(3) + np.zeros((1, 6, 1), int)).reshape(-1)
-    shape = 6 * count, 3 * tracks.count
-    across = sparse.csr_matrix((mixed.reshape(-1), (rows, columns)), shape)
-    gain = sparse.csr_matrix(((mixed @ inverse[tracks.track]).reshape(-1), (rows, columns)), shape)
-    system = -(gain @ across.T).toarray()
-    for index in range(count):
-        at = slice(6 * index, 6 * index + 6)
-        system[at, at] += blocks[index]
-    move = -np.linalg.solve(system, right.reshape(-1) - gain @ point_right.reshape(-1)).reshape(count, 6)
-    back = point_right + (across.T @ move.reshape(-1)).reshape(-1, 3)
-    return move, -np.einsum("pij,pj->pi", inverse, back)
+    inverse = np.linalg.inv(blocks)
+    gain = across @ sparse.bsr_matrix((inverse, np.arange(tracks.count), np.arange(tracks.count + 1))).tocsr()
+    system -= (gain @ across.T).toarray()
+    move = -np.linalg.solve(system, right - gain @ point_right.reshape(-1))
+    back = point_right + (across.T @ move).reshape(-1, 3)
+    return move.reshape(count, 6), -np.einsum("pij,pj->pi", inverse, back)
