@@ -56,9 +56,7 @@ def check_given(trajectory: Trajectory, tracks: Tracks, K: Float[np.ndarray, "3 
     for text, changed in _misreadings(trajectory):
         other = _judge(changed, tracks, K)
         if other is not None and other[0] >= max(LEAST_SHARE, 2 * share):
-            raise CaptureError(
-                f"the poses that are given fit the images only when read as {text}: give world_from_camera"
-            )
+            raise CaptureError(f"the poses that are given fit the images only read as {text}: give world_from_camera")
     raise CaptureError(
         f"the poses that are given do not fit the images: of the depths they imply only {100 * share:.0f} % were "
         "measured; are they of these frames, in this order, with OpenCV's camera axes (x right, y down, z ahead)?"
