@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ipjax.metrics.poses import rotation_error as rotation_error
     from ipjax.metrics.poses import scale_error as scale_error
+    from ipjax.metrics.poses import symmetric_errors as symmetric_errors
     from ipjax.metrics.poses import translation_error as translation_error
     from ipjax.metrics.poses import turn_angle as turn_angle
     from ipjax.metrics.precision import OVERLAPS as OVERLAPS
@@ -28,11 +29,16 @@ if TYPE_CHECKING:
     from ipjax.metrics.precision import match_poses as match_poses
     from ipjax.metrics.precision import overlap_precision as overlap_precision
     from ipjax.metrics.recalls import ADD_LIMIT as ADD_LIMIT
+    from ipjax.metrics.recalls import GRASP_LIMIT as GRASP_LIMIT
     from ipjax.metrics.recalls import PIXEL_THRESHOLDS as PIXEL_THRESHOLDS
+    from ipjax.metrics.recalls import SHIFT_LIMIT as SHIFT_LIMIT
     from ipjax.metrics.recalls import SIZE_TOLERANCES as SIZE_TOLERANCES
     from ipjax.metrics.recalls import THRESHOLDS as THRESHOLDS
+    from ipjax.metrics.recalls import TURN_LIMIT as TURN_LIMIT
     from ipjax.metrics.recalls import area_under_accuracy as area_under_accuracy
+    from ipjax.metrics.recalls import auc as auc
     from ipjax.metrics.recalls import average_recall as average_recall
+    from ipjax.metrics.recalls import pose_recall as pose_recall
     from ipjax.metrics.recalls import recall as recall
     from ipjax.metrics.surface import SizedErrors as SizedErrors
     from ipjax.metrics.surface import add as add
@@ -54,15 +60,19 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ADD_LIMIT",
+    "GRASP_LIMIT",
     "OVERLAPS",
     "PIXEL_THRESHOLDS",
+    "SHIFT_LIMIT",
     "SIZE_TOLERANCES",
     "SYMMETRY_STEP",
     "THRESHOLDS",
+    "TURN_LIMIT",
     "SizedErrors",
     "add",
     "add_s",
     "area_under_accuracy",
+    "auc",
     "average_precision",
     "average_recall",
     "box_overlaps",
@@ -76,6 +86,7 @@ __all__ = [
     "mspd",
     "mssd",
     "overlap_precision",
+    "pose_recall",
     "projection_distance",
     "projections_overlap",
     "recall",
@@ -85,6 +96,7 @@ __all__ = [
     "sized_errors",
     "spheres_overlap",
     "surface_distance",
+    "symmetric_errors",
     "translation_error",
     "turn_angle",
     "visibility",
@@ -96,6 +108,7 @@ _HOMES = {
     "poses": (
         "rotation_error",
         "scale_error",
+        "symmetric_errors",
         "translation_error",
         "turn_angle",
     ),
@@ -111,11 +124,16 @@ _HOMES = {
     ),
     "recalls": (
         "ADD_LIMIT",
+        "GRASP_LIMIT",
         "PIXEL_THRESHOLDS",
+        "SHIFT_LIMIT",
         "SIZE_TOLERANCES",
         "THRESHOLDS",
+        "TURN_LIMIT",
         "area_under_accuracy",
+        "auc",
         "average_recall",
+        "pose_recall",
         "recall",
     ),
     "surface": (

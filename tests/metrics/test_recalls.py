@@ -34,6 +34,47 @@ def test_area_under_accuracy_by_hand():
     assert area() == 0.0
 
 
+@given(hnp.arrays(np.float32, 12, elements=st.floats(0, 0.25, width=32)))
+def test_the_exact_area_is_the_integral_of_recalls(errors):
+    grid = (np.arange(20_000, dtype=np.float32) + 0.5) / 20_000 * 0.1
+    for found in (metrics.auc(errors, 0.1), metrics.auc(jnp.asarray(errors), 0.1)):
+        np.testing.assert_allclose(found, metrics.recall(errors, grid).mean(), atol=1e-4)
+    # The toolbox's curve is one step ahead, up to the largest error below the limit.
+    toolbox = metrics.area_under_accuracy(jnp.asarray(errors), 0.1)
+    largest = max((float(e) for e in errors if e <= 0.1), default=0.0)
+    np.testing.assert_allclose(toolbox - metrics.auc(errors, 0.1), largest / 0.1 / 12, atol=1e-5)
+
+
+def test_the_exact_area_by_hand():
+    area = lambda *errors: float(metrics.auc(np.array(errors, np.float64)))
+    assert area(0.0, 0.0) == 1.0
+    assert area(0.05) == pytest.approx(0.5, abs=1e-15)
+    assert area(0.02, np.inf) == pytest.approx(0.4, abs=1e-15)
+    assert area(0.02, np.nan, 0.1, 7.0) == pytest.approx(0.2, abs=1e-15)
+    assert area() == 0.0
+    many = metrics.auc(np.array([[0.0, 0.05], [0.1, 0.08]]))
+    np.testing.assert_allclose(many, [0.75, 0.1], atol=1e-15)
+    assert float(metrics.auc(np.array([30.0]), 100.0)) == pytest.approx(0.7)  # any unit that both share
+
+
+def test_five_degrees_and_five_centimetres_are_strict_and_both():
+    degrees = np.array([4.9, 5.1, 4.9, 0.0, np.inf, np.nan, 0.0])
+    metres = np.array([0.049, 0.049, 0.051, 0.05, np.inf, 0.0, 0.0])
+    for asarray in (np.asarray, lambda x: jnp.asarray(x, jnp.float32)):
+        share = metrics.pose_recall(asarray(np.radians(degrees)), asarray(metres))
+        assert float(share) == pytest.approx(2 / 7)
+    assert float(metrics.pose_recall(np.zeros(0), np.zeros(0))) == 0.0
+    assert float(metrics.pose_recall(np.radians(degrees), metres, np.radians(6), 0.05)) == pytest.approx(3 / 7)
+
+
+def test_recalls_of_doubles_are_in_doubles():
+    limit = metrics.GRASP_LIMIT
+    errors = np.array([np.nextafter(limit, 0), limit, np.nextafter(limit, 1)])
+    found = metrics.recall(errors, np.array([limit]))
+    assert isinstance(found, np.ndarray) and found.dtype == np.float64
+    assert found[0] == 1 / 3
+
+
 def test_recall_is_strict():
     errors = jnp.array([0.0, 5.0, 10.0, jnp.inf, jnp.nan])
     np.testing.assert_allclose(metrics.recall(errors, jnp.array([5.0, 10.0, 100.0])), [0.2, 0.4, 0.6])

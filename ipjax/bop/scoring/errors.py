@@ -81,26 +81,35 @@ def farthest_distances(model: Model, truths: Similarity[np.ndarray], estimates: 
     return np.array([metrics.surface_distance(hull, *pair) for pair in pairs], np.float64)
 
 
+def least_turns(
+    model: Model, truths: Similarity[np.ndarray], estimates: Similarity[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation errors [v], radians, and translation errors [v], metres, of pairs of poses, to the symmetric pose whose
+    rotation is nearest (`surface_errors` has those to the one that attains MSSD)."""
+    pairs = ((_at(truths, row), _at(estimates, row)) for row in range(len(truths.scale)))
+    found = np.array([metrics.symmetric_errors(model.symmetries, *pair) for pair in pairs], np.float64).reshape(-1, 2)
+    return found[:, 0], found[:, 1]
+
+
 def average_distances(
     model: Model,
     truths: Similarity[np.ndarray],
     estimates: Similarity[np.ndarray],
     *,
     nearest: bool,
-    pre_check: bool = True,
 ) -> np.ndarray:
     """ADD [v], or ADD-S with ``nearest``, of pairs of poses; one k-d tree of the model serves all of them.
 
-    BOP's pre-check makes it infinite where the origins are a diameter apart.
+    Without BOP's pre-check, by which it is infinite where the origins are a diameter apart: the area under a curve to
+    10 cm also counts what is that far off. Where the check matters, MSSD is infinite.
     """
     from scipy.spatial import KDTree
 
     count = len(truths.scale)
     tree = KDTree(model.points) if nearest and count else None
     query = None if tree is None else (lambda points: tree.query(points, workers=-1)[0])
-    near = metrics.spheres_overlap(model.diameter, truths, estimates) if pre_check else np.ones(count, bool)
-    found = np.full(count, np.inf)
-    for row in np.flatnonzero(near):
+    found = np.zeros(count)
+    for row in range(count):
         pair = _at(truths, row), _at(estimates, row)
         found[row] = metrics.add_s(model.points, *pair, nearest=query) if nearest else metrics.add(model.points, *pair)
     return found

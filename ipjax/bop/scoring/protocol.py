@@ -14,7 +14,7 @@ import numpy as np
 from ipjax.bop.records import DatasetError, TargetRow, Truth, check_rotation
 from ipjax.bop.results import ResultRow, read_results, sized_path
 from ipjax.bop.scoring.conventions import suspect_conventions
-from ipjax.bop.scoring.errors import Model, average_distances, farthest_distances, stack, surface_errors
+from ipjax.bop.scoring.errors import Model, average_distances, farthest_distances, least_turns, stack, surface_errors
 from ipjax.transforms import Similarity
 
 YCBV_SYMMETRIC = frozenset({1, 13, 14, 16, 18, 19, 20, 21})  # ADD(-S) uses ADD-S for these (dataset_params.py)
@@ -34,6 +34,8 @@ class ScoredTarget:
     mspd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     rotation: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     translation: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    least_turn: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    shift: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     add: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     add_s: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     sized_mssd: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
@@ -223,6 +225,7 @@ class Protocol:
         width = np.array([s.width for s, _, _ in pairs], np.float64)
         measured["mssd"], measured["mspd"] = surface.mssd, surface.mspd * 640 / np.maximum(width, 1)
         measured["rotation"], measured["translation"] = surface.rotation, surface.translation
+        measured["least_turn"], measured["shift"] = least_turns(model, truths, found)
         if {"add", "add_s"} & set(metrics):
             measured["add"] = average_distances(model, truths, found, nearest=False)
             measured["add_s"] = average_distances(model, truths, found, nearest=True)
@@ -231,7 +234,7 @@ class Protocol:
             sized = Similarity(found.rotation, found.translation, scales)
             measured["sized_mssd"] = farthest_distances(model, truths, sized)
             nearest = obj_id in self.symmetric
-            measured["sized_add"] = average_distances(model, truths, sized, nearest=nearest, pre_check=False)
+            measured["sized_add"] = average_distances(model, truths, sized, nearest=nearest)
         place = {(id(target), e, g): row for row, (target, e, g) in enumerate(pairs)}
         for target in targets:
             shape = (len(target.estimates), len(target.truths))

@@ -81,7 +81,21 @@ def find_instances(targets: list[ScoredTarget]) -> list[Instance]:
                 nothing = math.inf
                 vsd = 1.0 if target.vsd.size else math.nan
                 found.append(
-                    Instance(*place, False, 0.0, nothing, nothing, vsd, nothing, nothing, nothing, nothing, math.nan)
+                    Instance(
+                        *place,
+                        found=False,
+                        score=0.0,
+                        mssd=nothing,
+                        mspd=nothing,
+                        vsd=vsd,
+                        add=nothing,
+                        add_s=nothing,
+                        rotation=nothing,
+                        translation=nothing,
+                        scale=math.nan,
+                        least_turn=nothing,
+                        shift=nothing,
+                    )
                 )
                 continue
             found.append(
@@ -99,6 +113,8 @@ def find_instances(targets: list[ScoredTarget]) -> list[Instance]:
                     math.nan if (scale := target.estimates[e].scale) is None else abs(scale - 1),
                     float(target.sized_mssd[e, g]) if target.sized_mssd.size else math.nan,
                     float(target.sized_add[e, g]) if target.sized_add.size else math.nan,
+                    float(target.least_turn[e, g]),
+                    float(target.shift[e, g]),
                 )
             )
     return found
@@ -129,16 +145,18 @@ def find_medians(instances: list[Instance]) -> dict[str, float]:
 
 
 def summarise_distances(instances: list[Instance], protocol: Protocol) -> dict[str, float]:
-    """Areas under the accuracy curves of ADD and ADD-S, and the shares of instances below a tenth of the diameter."""
+    """Areas under the accuracy curves of ADD and ADD-S as PoseCNN's toolbox sums them, and the shares of instances that
+    pass BOP's pre-check and are below a tenth of the diameter."""
     add, add_s = np.array([i.add for i in instances]), np.array([i.add_s for i in instances])
     either = np.array([i.add_s if i.obj_id in protocol.symmetric else i.add for i in instances])
-    diameters = np.array([protocol.infos[i.obj_id].diameter for i in instances])
+    tenths = np.array([0.1 * protocol.infos[i.obj_id].diameter for i in instances])
+    near = np.isfinite([i.mssd for i in instances])
     return {
         "add_auc": _area(add),
         "add_s_auc": _area(add_s),
         "add_or_s_auc": _area(either),
-        "recall_01d": float(np.mean(either < 0.1 * diameters)),
-        "add_s_01d": float(np.mean(add_s < 0.1 * diameters)),
+        "recall_01d": float(np.mean(near & (either < tenths))),
+        "add_s_01d": float(np.mean(near & (add_s < tenths))),
     }
 
 

@@ -207,6 +207,7 @@ def _summarise(
             f"one frame per scene, without {left_out}": summary(one_per_scene(kept)),
             f"all frames, without {left_out}": summary(trusted),
         }
+    seconds = {(r.scene_id, r.im_id): r.time for r in rows if r.time >= 0}
     of_object = np.array([s.row.obj_id for s in targets])
     found = [i for i in instances if i.found]
     per_object: dict[int, dict[str, float]] = {}
@@ -216,8 +217,9 @@ def _summarise(
         entry |= average_recalls(hits, counts, of_object == obj)
         entry |= {f"sized_{k}": v for k, v in average_recalls(sized, counts, of_object == obj).items()}
         entry |= find_medians(mine)
+        known = [seconds[p] for p, o in zip(place, of_object, strict=True) if o == obj and p in seconds]
+        entry |= {"seconds": float(np.mean(known))} if known else {}
         per_object[obj] = entry
-    seconds = {(r.scene_id, r.im_id): r.time for r in rows if r.time >= 0}
     return Score(
         dataset=f"{protocol.dataset.name}-{protocol.dataset.split}",
         method=method,

@@ -22,13 +22,15 @@ class Instance:
     mssd: float  # metres
     mspd: float  # pixels, for an image 640 wide
     vsd: float  # mean over tolerances; NaN where it was not asked for
-    add: float
-    add_s: float
-    rotation: float  # radians, symmetry-aware
-    translation: float  # metres
+    add: float  # metres; NaN where it was not asked for
+    add_s: float  # likewise
+    rotation: float  # radians, to the symmetric pose that attains MSSD
+    translation: float  # metres, likewise
     scale: float  # |estimated / true − 1|; NaN where the scale is unknown
     sized_mssd: float = math.nan  # metres, with the model at its estimated size; NaN likewise
     sized_add: float = math.nan  # likewise; ADD-S for objects with symmetries
+    least_turn: float = math.nan  # radians, to the symmetric pose whose rotation is nearest
+    shift: float = math.nan  # metres, to the same pose
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,8 @@ class Score:
     one_frame_per_scene: Summary  # the first target image of each scene
     without: dict[str, Summary]  # the same two, by title, without the images that the caller doubts; or empty
     curves: dict[str, list[float]]  # recall at each threshold
-    objects: dict[int, dict[str, float]]  # average recalls (and others) by object
+    # By object: targets, average recalls, medians, and ``seconds`` for an image that shows it, where that is known.
+    objects: dict[int, dict[str, float]]
     medians: dict[str, float]  # rotation_deg, translation_mm, scale_percent over the instances that got an estimate
     missing: int  # instances without an estimate
     add: dict[str, float]  # add_auc, add_s_auc, add_or_s_auc, recall_01d, add_s_01d; empty unless asked for

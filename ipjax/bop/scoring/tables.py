@@ -19,13 +19,13 @@ def format_score(found: Score) -> str:
     lines = [f"{found.method} on {found.dataset}", ""]
     rows = [["", "images", "targets", *(heads[n] for n in names)]]
     for title, part in found.parts().items():
-        cells = [_percent(part.recalls[n], part.intervals.get(n)) for n in names]
+        cells = [percent(part.recalls[n], part.intervals.get(n)) for n in names]
         rows.append([title, str(part.images), str(part.targets), *cells])
     if found.against:
-        cells = [_percent(found.against["recalls"][n]) if n in found.against["recalls"] else "–" for n in names]
+        cells = [percent(found.against["recalls"][n]) if n in found.against["recalls"] else "–" for n in names]
         rows.append([f"{found.against['method']}, all frames", "", "", *cells])
     lines += [
-        *_columns(rows),
+        *in_columns(rows),
         "",
         "Recalls in %; brackets: 95 % bootstrap over images. One frame per scene: the first."
         + (" Without SCENE/IMAGE: its annotation is in doubt." if found.without else ""),
@@ -33,11 +33,11 @@ def format_score(found: Score) -> str:
     if found.all_frames.sized:
         rows = [["", *SIZED.values()]]
         for title, part in found.parts().items():
-            rows.append([title, *(_percent(part.sized[n], part.sized_intervals.get(n)) for n in SIZED)])
+            rows.append([title, *(percent(part.sized[n], part.sized_intervals.get(n)) for n in SIZED)])
         lines += [
             "",
             "With the model at its estimated size, which the recalls above do not see (%; in true diameters):",
-            *_columns(rows),
+            *in_columns(rows),
             "",
         ]
     if found.medians:
@@ -53,8 +53,8 @@ def format_score(found: Score) -> str:
     if found.add:
         a = found.add
         area = (
-            f"AUC to 10 cm: ADD {100 * a['add_auc']:.1f}, ADD-S {100 * a['add_s_auc']:.1f}, ADD(-S) "
-            f"{100 * a['add_or_s_auc']:.1f}; below"
+            f"AUC to 10 cm, as PoseCNN's toolbox sums it: ADD {100 * a['add_auc']:.1f}, "
+            f"ADD-S {100 * a['add_s_auc']:.1f}, ADD(-S) {100 * a['add_or_s_auc']:.1f}; below"
         )
         lines.append(
             f"{area if found.all_frames.targets >= FEW else 'Below'} 0.1 d: ADD(-S) {100 * a['recall_01d']:.1f} %, "
@@ -73,14 +73,14 @@ def format_score(found: Score) -> str:
     if found.against:
         rows[0] += [found.against["method"], "better"]
     for obj, entry in found.objects.items():
-        cells = [str(obj), f"{entry['targets']:.0f}", *(_percent(entry[n]) for n in names)]
+        cells = [str(obj), f"{entry['targets']:.0f}", *(percent(entry[n]) for n in names)]
         cells += [f"{entry[k]:.1f}" if k in entry else "–" for k in ("rotation_deg", "translation_mm")]
         if found.against:
             key = found.against["metric"]
             other = found.against["objects"].get(obj, {}).get(key)
-            cells += ["–", ""] if other is None else [_percent(other), _sign(entry[key] - other)]
+            cells += ["–", ""] if other is None else [percent(other), _sign(entry[key] - other)]
         rows.append(cells)
-    lines += ["", *_columns(rows)]
+    lines += ["", *in_columns(rows)]
     if found.against:
         a = found.against
         lines.append(
@@ -93,7 +93,8 @@ def format_score(found: Score) -> str:
     return "\n".join(lines)
 
 
-def _percent(value: float, interval: Sequence[float] | None = None) -> str:
+def percent(value: float, interval: Sequence[float] | None = None) -> str:
+    """A share in %, with the brackets of its interval."""
     text = f"{100 * value:.1f}"
     return text if not interval else f"{text} [{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]"
 
@@ -102,7 +103,8 @@ def _sign(gain: float) -> str:
     return "+" if gain > 0 else "−" if gain < 0 else "="
 
 
-def _columns(rows: list[list[str]]) -> list[str]:
+def in_columns(rows: list[list[str]]) -> list[str]:
+    """Lines of a table whose cells stand below one another; all columns but the first are set to the right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     return [
         "  ".join(
