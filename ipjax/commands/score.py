@@ -24,10 +24,10 @@ examples:
 
 Poses are CSVs, detections JSON (also .json.gz), npz of CNOS or SAM-6D, or a folder of such.
 
-Of poses it tells BOP's recalls and, for each object, their mean and all instances: the areas under the accuracy curves
-of ADD and ADD-S from 0 to 10 cm (exact; PoseCNN), the shares with ADD-S below 2 cm (DenseFusion) and within 5° and
-5 cm (of the symmetric poses, the one whose rotation is nearest counts), and the files' seconds for an image. What a
-file lacks counts as infinitely wrong. ADD and ADD-S are always measured. Of several data sets every participant has a file for each, in the same order.
+Of poses it tells BOP's recalls (--metrics) and, for each object, their mean and all targets: the areas under the
+accuracy curves of ADD and ADD-S from 0 to 10 cm (exact; PoseCNN), the shares with ADD-S below 2 cm (DenseFusion) and
+within 5° and 5 cm (of the symmetric poses, the one whose rotation is nearest counts), and the files' seconds for an
+image. What a file lacks counts as infinitely wrong. On several data sets every participant has a file for each.
 
 Of detections it tells COCO's average precisions (IoU 0.5 … 0.95) of boxes and of masks; what is less than a tenth
 visible need not be found.

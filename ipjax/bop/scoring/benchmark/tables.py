@@ -22,7 +22,7 @@ PRECISIONS = {"ap_mssd": "AP_MSSD", "ap_mspd": "AP_MSPD", "map": "mAP", "ap_mssd
 SECONDS = "Seconds per image"
 DEFINITIONS = (
     "AUC: the exact area under the share of targets with a smaller error, from 0 to 10 cm (PoseCNN, arXiv:1711.00199; "
-    "its toolbox's sum is higher by up to 1 / targets). ADD-S below 2 cm: DenseFusion (arXiv:1901.04780). 5° and 5 cm: "
+    "its toolbox's sum is higher by up to 1 / targets); ADD knows no symmetries. ADD-S below 2 cm: DenseFusion (arXiv:1901.04780). 5° and 5 cm: "
     "of the symmetric poses, the one whose rotation is nearest counts. A target without an estimate is infinitely "
     "wrong. Seconds: the file's own time of an image, for all objects in it."
 )
