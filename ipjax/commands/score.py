@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     if not several:
         messages.say(format_score(scores[0]) + "\n")
     messages.say(format_benchmark(found))
-    document = {"scores": [one.to_dict() for one in scores]} if several else scores[0].to_dict()
+    document: dict[str, Any] = {"scores": [one.to_dict() for one in scores]} if several else scores[0].to_dict()
     document["benchmark"] = found.to_dict()
     if arguments.output is not None:
         from ipjax.files.storage.writing import write_text

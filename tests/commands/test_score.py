@@ -61,7 +61,9 @@ def test_participants_side_by_side_on_two_data_sets(tmp_path, capfd, monkeypatch
     assert "must end in .html or .htm" in refused("--page", a)
     assert "--against belongs to one result file" in refused("--against", a)
     assert "as the last word, their data set's folder" in refused("--beside", str(roots[1]))
-    assert "every data set needs a result file of each participant" in refused("--beside", c, str(roots[1]))
+    assert "every data set needs a result file of each participant" in refused(
+        "--beside", c, str(roots[1] / "train_pbr")
+    )
     assert run(["score", str(roots[0]), a]) == 2
     assert "a.csv is a file: the last word is the folder of the data set" in capfd.readouterr().err
     boxes = tmp_path / "boxes.json"

@@ -44,10 +44,10 @@ def render_benchmark(found: Benchmark) -> str:
     ]
     tables = []
     for kind in kinds:
-        columns = [list_rows(entry, found.objects()) for entry in found.entries]
+        columns = [dict(list_rows(entry, found.objects())) for entry in found.entries]
         rows = [
-            {"name": line[0][0], "cells": _cells(found, kind, [one for _, one in line]), "sum": line[0][0] == "mean"}
-            for line in zip(*columns, strict=True)
+            {"name": name, "cells": _cells(found, kind, [column[name] for column in columns]), "sum": name == "mean"}
+            for name in columns[0]
         ]
         tables.append({"title": kind.title, "rows": rows})
     on = " and ".join(found.datasets) if len(found.datasets) < 3 else ", ".join(found.datasets)

@@ -22,9 +22,9 @@ PRECISIONS = {"ap_mssd": "AP_MSSD", "ap_mspd": "AP_MSPD", "map": "mAP", "ap_mssd
 SECONDS = "Seconds per image"
 DEFINITIONS = (
     "AUC: the exact area under the share of targets with a smaller error, from 0 to 10 cm (PoseCNN, arXiv:1711.00199; "
-    "its toolbox's sum is higher by up to 1 / targets); ADD knows no symmetries. ADD-S below 2 cm: DenseFusion (arXiv:1901.04780). 5° and 5 cm: "
-    "of the symmetric poses, the one whose rotation is nearest counts. A target without an estimate is infinitely "
-    "wrong. Seconds: the file's own time of an image, for all objects in it."
+    "its toolbox's sum is higher by up to 1 / targets); ADD knows no symmetries. ADD-S below 2 cm: DenseFusion "
+    "(arXiv:1901.04780). 5° and 5 cm: of the symmetric poses, the one whose rotation is nearest counts. A target "
+    "without an estimate is infinitely wrong. Seconds: the file's own time of an image, for all objects in it."
 )
 
 
@@ -36,6 +36,7 @@ def format_benchmark(found: Benchmark) -> str:
         entry = found.entries[0]
         rows = [["object", "found", "AUC ADD", "AUC ADD-S", "ADD-S < 2 cm", "5° 5 cm", "seconds"]]
         for name, figures in list_rows(entry):
+            assert figures is not None  # the objects are the entry's own
             shares = [percent(getattr(figures, key)) for key in SHARES]
             rows.append([name, f"{figures.found}/{figures.targets}", *shares, format_seconds(figures)])
         lines += ["By object (%):", *in_columns(rows)]
