@@ -50,12 +50,10 @@ def render_benchmark(found: Benchmark) -> str:
             for name in columns[0]
         ]
         tables.append({"title": kind.title, "rows": rows})
-    on = " and ".join(found.datasets) if len(found.datasets) < 3 else ", ".join(found.datasets)
     return render_page(
         _TEMPLATE,
         title=", ".join(found.participants),
-        lead=f"{on}; {found.entries[0].all.targets} targets on {found.datasets[0]}"
-        + "".join(f", {found.of(title)[0].all.targets} on {title}" for title in found.datasets[1:]),
+        lead=", ".join(f"{title}: {found.of(title)[0].all.targets} targets" for title in found.datasets),
         participants=[{"name": name, **_stroke(number)} for number, name in enumerate(found.participants)],
         datasets=found.datasets,
         notes=found.all_notes(),
