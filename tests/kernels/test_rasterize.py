@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ipjax_kernels import reference_raster
+from ipjax_kernels.reference import raster as reference_raster
 from ipjax_kernels.rasterize import rasterize, splat_colours, splat_depth
 
 HEIGHT, WIDTH = 13, 17
