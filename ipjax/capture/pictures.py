@@ -31,7 +31,7 @@ def draw_trajectory(
 
     known = np.flatnonzero(trajectory.registered)
     poses = trajectory.world_from_camera
-    upright = _find_upright(trajectory)
+    upright = find_upright(trajectory)
     corners = np.array([[0, 0], [size[0], 0], [size[0], size[1]], [0, size[1]]], float) - 0.5
     places = poses.translation[known] @ upright.T
     near = points @ upright.T if len(points) else places
@@ -63,23 +63,24 @@ def draw_trajectory(
             for one, other in zip(rest, [*rest[1:], rest[0]], strict=True):
                 cv2.line(image, one.tolist(), other.tolist(), colour, 1, cv2.LINE_AA)
                 cv2.line(image, tip.tolist(), one.tolist(), colour, 1, cv2.LINE_AA)
-        _write(image, title, (panel * _PANEL + 12, 24))
+        write_line(image, title, (panel * _PANEL + 12, 24))
         length = 10.0 ** np.floor(np.log10(reach / 2))  # of the bar, metres
         start = (panel * _PANEL + 12, _PANEL - 14)
         cv2.line(image, start, (start[0] + round(length * zoom), start[1]), (0, 0, 0), 2)
-        _write(image, f"{length:g} m", (start[0], start[1] - 8))
+        write_line(image, f"{length:g} m", (start[0], start[1] - 8))
     for line, note in enumerate(notes):
-        _write(image, note.replace("×", "x").replace("°", " deg"), (12, _PANEL + 24 * (line + 1) - 6))
+        write_line(image, note.replace("×", "x").replace("°", " deg"), (12, _PANEL + 24 * (line + 1) - 6))
     return image
 
 
-def _write(image: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int]) -> None:
+def write_line(image: UInt8[np.ndarray, "h w 3"], text: str, place: tuple[int, int]) -> None:
+    """A line of text, its lower left corner at ``place``."""
     import cv2
 
     cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def _find_upright(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
+def find_upright(trajectory: Trajectory) -> Float[np.ndarray, "3 3"]:
     """A rotation to axes of which the second points down, as most cameras are held, and the first along their path."""
     known = trajectory.registered
     rotation, places = trajectory.world_from_camera.rotation[known], trajectory.world_from_camera.translation[known]

@@ -103,21 +103,25 @@ def fit_planes(
     number = jnp.sum(share, axis=0)
     mean = jnp.sum(share * parts, axis=0) / jnp.maximum(number, 1)
     step = share * (parts - mean)  # small numbers: their products keep their digits
-    # Sums over each block, about its middle: 1, x, y, x², x y, y², and of its inverse depths (less their mean) x w, y w.
+    # Sums over each block, about its middle: 1, x, y, x², xy, y², and of its inverse depths, less their mean, xw, yw.
     sums = [share, share * inner_x, share * inner_y, share * inner_x**2, share * inner_x * inner_y, share * inner_y**2]
     sums = jnp.stack([jnp.sum(each, axis=0) for each in [*sums, step * inner_x, step * inner_y]])
     padded = jnp.pad(jnp.concatenate([sums, mean[None]]), ((0, 0), (radius, radius), (radius, radius)))
-    total = [jnp.zeros_like(mean)] * 9
-    for y in range(-radius, radius + 1):
+
+    def add_row(y, total):  # a loop over rows, for the compiler's sake
+        down = y.astype(dtype)
         for x in range(-radius, radius + 1):
             block = lax.dynamic_slice(padded, (0, radius + y, radius + x), (9, height, width))
             off = block[8] - mean
             same = (block[0] > 0) & (number > 0) & (jnp.abs(off) < radius * jump * mean)
             n, sx, sy, sxx, sxy, syy, sxw, syw = (jnp.where(same, each, 0) for each in block[:8])
             off = jnp.where(same, off, 0)
-            fresh = (n, sx + x * n, sy + y * n, sxx + 2 * x * sx + x**2 * n, sxy + x * sy + y * sx + x * y * n)
-            fresh += (syy + 2 * y * sy + y**2 * n, n * off, sxw + off * (sx + x * n), syw + off * (sy + y * n))
-            total = [one + other for one, other in zip(total, fresh, strict=True)]
+            fresh = (n, sx + x * n, sy + down * n, sxx + 2 * x * sx + x**2 * n, sxy + x * sy + down * (sx + x * n))
+            fresh += (syy + 2 * down * sy + down**2 * n, n * off, sxw + off * (sx + x * n), syw + off * (sy + down * n))
+            total = tuple(one + other for one, other in zip(total, fresh, strict=True))
+        return total
+
+    total = lax.fori_loop(-radius, radius + 1, add_row, (jnp.zeros_like(mean),) * 9)
     n, sx, sy, sxx, sxy, syy, sw, sxw, syw = total
     count = jnp.maximum(n, 1)
     mean_x, mean_y, mean_w = sx / count, sy / count, sw / count

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ipjax_kernels.reference import raster as reference_raster
 from ipjax_kernels.rasterize import rasterize, splat_colours, splat_depth
+from ipjax_kernels.reference import raster as reference_raster
 
 HEIGHT, WIDTH = 13, 17
 FOCAL, CENTRE = np.array([20.0, 22.0], np.float32), np.array([7.3, 6.6], np.float32)

@@ -34,7 +34,7 @@ def take(poses: Similarity[np.ndarray], index: Int[np.ndarray, " k"]) -> Similar
     return Similarity(poses.rotation[index], poses.translation[index], poses.scale[index])
 
 
-def lever(target_from_source: Similarity[np.ndarray]) -> Float[np.ndarray, "p 6 6"]:
+def lever(target_from_source: Similarity[np.ndarray]) -> Float[np.ndarray, "*b 6 6"]:
     """From a small motion (turn, shift) in the source's axes to the same in the target's: the adjoint."""
     rotation, (x, y, z) = target_from_source.rotation, np.moveaxis(target_from_source.translation, -1, 0)
     zero = np.zeros_like(x)

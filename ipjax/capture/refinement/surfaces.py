@@ -47,19 +47,17 @@ def make_levels(
     whole = (height + pad[0][1], width + pad[1][1])
     values = {}
     for shrink in sorted({shrink for shrink, _ in shrinkings}):
-        small = resize(camera, (whole[1], whole[0]), (whole[1] // shrink, whole[0] // shrink)) if shrink > 1 else camera
-        jump = _jump(small)
+        size = whole[1] // shrink, whole[0] // shrink
+        small = resize(camera, (whole[1], whole[0]), size) if shrink > 1 else camera
+        jump = 0.01 + SLANT / float(np.asarray(small.focal).min())
         frames = []
         for k, depth in enumerate(depths):
-            inverse = np.pad(np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0), pad).astype(np.float32)
-            light = np.zeros(whole, np.float32) if brightness is None else np.pad(brightness[k], pad).astype(np.float32)
-            frames.append(_make_values(inverse, light, small.focal, small.centre, jump, shrink))
+            inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0)
+            light = np.zeros_like(depth) if brightness is None else brightness[k]
+            both = (jnp.asarray(np.pad(image, pad), jnp.float32) for image in (inverse, light))
+            frames.append(_make_values(*both, small.focal, small.centre, jnp.float32(jump), shrink))
         values[shrink] = Images(jnp.stack(frames), small.focal, small.centre), jump
     return {key: Level(values[key[0]][0], _take(values[key[0]][0], key[1]), values[key[0]][1]) for key in shrinkings}
-
-
-def _jump(camera: Camera) -> float:
-    return 0.01 + SLANT / float(np.asarray(camera.focal).min())
 
 
 @partial(jax.jit, static_argnames=("shrink",))
@@ -68,7 +66,7 @@ def _make_values(
     brightness: Float[Array, "h w"],
     focal: Float[Array, "2"],
     centre: Float[Array, "2"],
-    jump: float,
+    jump: Float[Array, ""],
     shrink: int,
 ) -> Float[Array, "a b 5"]:
     plane, normals = fit_planes(inverse, focal, centre, jump, shrink=shrink, radius=RADIUS)

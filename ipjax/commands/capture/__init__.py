@@ -2,13 +2,14 @@
 
 from typing import Any
 
-from ipjax.commands.capture import pose
+from ipjax.commands.capture import pose, refine
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (pose,)  # as --help lists them
+STEPS = (pose, refine)  # as --help lists them
 EXAMPLES = """\
 examples:
   ipjax capture pose table/ -o work/       where the camera stood, frame by frame: work/poses.json
+  ipjax capture refine table/ -o work/     the same, made exact: work/refined.json
 
 A capture is a folder of frames: rgb/NAME.png, depth/NAME.png (registered to the colours), camera.json, and, if they are
 known, poses.json and ignore.png (non-zero = moves with the camera); a TUM RGB-D sequence; or a scene of a BOP data set.

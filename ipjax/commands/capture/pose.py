@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from ipjax.commands.capture.bars import Bars
 from ipjax.commands.capture.opening import add_capture, open_given
 from ipjax.commands.interface import options
 from ipjax.commands.interface.messages import Messages
@@ -50,7 +51,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     work: Path = options.check_folder(arguments.output)
     board = None if arguments.board is None else parse_board(arguments.board)
     capture = open_given(arguments)
-    with _Bars(quiet=arguments.quiet) as bars:
+    with Bars(quiet=arguments.quiet) as bars:
         found = find_poses(
             capture,
             arguments.method,
@@ -86,27 +87,3 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         }
     )
     return 1 if lost else 0
-
-
-class _Bars:
-    """A progress bar for each part of the work."""
-
-    def __init__(self, *, quiet: bool):
-        self.quiet, self.part, self.bar = quiet, "", None
-
-    def __enter__(self) -> "_Bars":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-    def show(self, part: str, done: int, total: int) -> None:
-        """``done`` of ``total`` of this part are done."""
-        from ipjax.progress import bar
-
-        if part != self.part:
-            self.__exit__()
-            self.part, self.bar = part, bar(total=total, desc=part, disable=self.quiet, leave=False)
-        if self.bar is not None:
-            self.bar.update(done - self.bar.n)
