@@ -2,6 +2,7 @@
 
     python -m benchmarks.captures poses --seeds 101 102 … [--factory 0]    made captures of 24 views
     python -m benchmarks.captures poses --real ../shared/data/captures     those whose poses are known
+    python -m benchmarks.captures refine --seeds 201 202 … [--ways global]  the same, and --real
     python -m benchmarks.captures page                                     benchmarks/results/captures.md
 
 A line of build/captures.jsonl for each capture and way; lines that are there are not made again.
@@ -10,12 +11,12 @@ A line of build/captures.jsonl for each capture and way; lines that are there ar
 import argparse
 from pathlib import Path
 
-from benchmarks.captures import poses
+from benchmarks.captures import poses, refinement
 from benchmarks.measure import commit, describe_device
 from ipjax.files.storage.parsing import parse_json
 from ipjax.files.storage.writing import append_json, read_lines, write_text
 
-STEPS = {"poses": poses}
+STEPS = {"poses": poses, "refine": refinement}
 PAGE = Path("benchmarks/results/captures.md")
 
 
@@ -28,6 +29,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[], help="of made captures")
     parser.add_argument("--views", type=int, default=24, help="of each made capture")
     parser.add_argument("--factory", type=float, default=1.0, help="error of the factory's calibration; 0 = none")
+    parser.add_argument("--ways", nargs="*", default=list(refinement.WAYS[:2]), help="refine: how, among all ways")
     parser.add_argument("--real", type=Path, metavar="FOLDER", help="real captures, a folder each")
     parser.add_argument("--output", type=Path, default=Path("build/captures.jsonl"))
     parser.add_argument("--page", type=Path, default=PAGE)

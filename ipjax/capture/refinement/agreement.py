@@ -74,7 +74,7 @@ def draw_agreement(
     before: Trajectory,
     after: Trajectory,
     notes: Sequence[str] = (),
-) -> UInt8[np.ndarray, "h w 3"]:
+) -> UInt8[np.ndarray, "a b 3"]:
     """The points of all frames from above and from the side, before and after; a colour a frame.
 
     Surfaces that are seen once where they are, thin and of mixed colours, are right; the same surface twice is not.

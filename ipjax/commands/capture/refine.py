@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.capture.moving import find_moving
     from ipjax.capture.poses.tracks import read_tracks
     from ipjax.capture.refinement.agreement import draw_agreement, list_neighbours, measure_agreement
-    from ipjax.capture.refinement.refinement import describe, refine
+    from ipjax.capture.refinement.refining import describe, refine
     from ipjax.capture.trajectories import read_trajectory, write_trajectory
     from ipjax.files.images.masks import read_mask
     from ipjax.files.storage.writing import write_text

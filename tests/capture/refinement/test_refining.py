@@ -8,7 +8,7 @@ from builders.ray_cast import K, cast, go_around
 
 from ipjax.capture.records import CaptureError, Tracks, Trajectory
 from ipjax.capture.refinement.certainty import off_by
-from ipjax.capture.refinement.refinement import Settings, describe, refine_frames
+from ipjax.capture.refinement.refining import Settings, describe, refine_frames
 from ipjax.records import Camera
 from ipjax.transforms import Similarity
 
