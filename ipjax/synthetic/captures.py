@@ -22,6 +22,7 @@ from ipjax.rendering.render import render_frames
 from ipjax.synthetic.objects import KINDS, make_object
 from ipjax.synthetic.sensor import STRUCTURED_LIGHT, Sensor, expose, sense_depth
 from ipjax.synthetic.tables import make_room, place_on_table
+from ipjax.synthetic.textures import make_texture
 from ipjax.transforms import rotation_from_vector
 
 DEPTH_UNIT = 0.0001  # metres per number of the depth images that are written
@@ -245,7 +246,8 @@ def _draw_path(rng: np.random.Generator, views: int, arc: float | int) -> Simila
     share = np.arange(views) / (views if arc >= 360 else max(views - 1, 1))
     step = np.deg2rad(arc) / views
     azimuth = rng.uniform(0, 2 * np.pi) + np.deg2rad(arc) * share + rng.normal(0, 0.12 * step, views)
-    waves = [np.sin(2 * np.pi * (rng.integers(1, 3) * share + rng.uniform())) for _ in range(2)]
+    # The hand rises and sinks, comes nearer and leaves, once or twice around the table.
+    waves = [np.sin(2 * np.pi * (rng.integers(1, 3) * share * min(arc / 360, 1) + rng.uniform())) for _ in range(2)]
     elevation = 0.72 + 0.2 * waves[0] + rng.normal(0, 0.03, views)
     distance = np.clip(0.7 + 0.14 * waves[1] + rng.normal(0, 0.02, views), 0.5, 0.9)
     backwards = np.stack(
@@ -269,8 +271,9 @@ def _make_gripper(rng: np.random.Generator) -> list[Mesh]:
         box = corners * [0.012, 0.05, 0.012] + [side * 0.055, 0.125, 0.28]
         vertices = np.concatenate([box[quad] for quad in sides])
         faces = np.concatenate([np.array([[0, 1, 2], [0, 2, 3]]) + 4 * k for k in range(6)])
-        colours = np.repeat(rng.uniform(30, 220, (6, 3)), 4, 0).astype(np.uint8)
-        fingers.append(make_mesh(vertices, faces, colours=colours))
+        square = np.array([[0.0, 0], [0.24, 0], [0.24, 1], [0, 1]])  # of the texture, as long as the fingers are
+        texture = make_texture(int(rng.integers(2**31)), 128)
+        fingers.append(make_mesh(vertices, faces, uv=np.tile(square, (6, 1)), texture=texture))
     return fingers
 
 

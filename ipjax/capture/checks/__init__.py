@@ -1,1 +1,1 @@
-"""What a capture is like before hours are spent on it: `inspection` measures, `findings` says what is wrong and what to do."""
+"""What a capture is like before hours are spent on it: `inspection` measures, `findings` says what is wrong."""

@@ -22,6 +22,7 @@ class Shift:
     across: float  # pixels by which depth has to be moved to the right to lie on the photo
     down: float
     gain: float  # how much stronger the photo's edges are there than where depth lies now, in spreads of all shifts
+    here: float  # how much stronger they are where depth lies now than elsewhere, in the same spreads
     certain: bool  # both halves of the frames agree, and the edges stand out
 
     @property
@@ -60,7 +61,10 @@ class EdgeCorrelation:
         """The best shift; None where there are too few outlines."""
         if sum(self._weights) < _FEWEST or min(self._weights) <= 0:
             return None
-        maps = [cv2.GaussianBlur(total / weight, (0, 0), 1.0) for total, weight in zip(self._sums, self._weights, strict=True)]
+        maps = [
+            cv2.GaussianBlur(total / weight, (0, 0), 1.0)
+            for total, weight in zip(self._sums, self._weights, strict=True)
+        ]
         both = sum(weight * image for weight, image in zip(self._weights, maps, strict=True)) / sum(self._weights)
         across, down = _find_peak(both)
         spread = 1.4826 * np.median(np.abs(both - np.median(both)))
@@ -68,7 +72,8 @@ class EdgeCorrelation:
         halves = [np.array(_find_peak(image)) for image in maps]
         apart = max(np.linalg.norm(half - [across, down]) for half in halves)
         stands_out = (both.max() - np.median(both)) > 5 * spread
-        return Shift(across, down, float((both.max() - here) / max(spread, 1e-9)), bool(stands_out and apart < 3))
+        gain, now = ((value / max(spread, 1e-9)) for value in (both.max() - here, here - np.median(both)))
+        return Shift(across, down, float(gain), float(now), bool(stands_out and apart < 3))
 
 
 def find_outlines(depth: Float[np.ndarray, "h w"]) -> np.ndarray:

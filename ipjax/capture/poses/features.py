@@ -141,7 +141,7 @@ def match(
     chosen = choose_pairs(features)
     raw = []
     with ThreadPoolExecutor(2) as pool:
-        for found in pool.map(lambda pair: _match_pair(features, *pair), chosen):
+        for found in pool.map(lambda pair: match_pair(features, *pair), chosen):
             raw.append(found)
             if progress is not None:
                 progress(len(raw), len(chosen))
@@ -189,7 +189,8 @@ def _mutual(
     return rows[kept], best[kept], value[kept]
 
 
-def _match_pair(features: Sequence[Features], first: int, second: int) -> Match:
+def match_pair(features: Sequence[Features], first: int, second: int) -> Match:
+    """Two frames by their descriptors alone: what is nearest to each other, and clearly so; not verified."""
     one, other = features[first], features[second]
     i, j, value = _mutual(one.descriptor, other.descriptor)
     points = np.stack([one.owner[i], other.owner[j]], axis=1)

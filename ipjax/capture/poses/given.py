@@ -53,7 +53,7 @@ def check_given(trajectory: Trajectory, tracks: Tracks, K: Float[np.ndarray, "3 
             )
         return Trajectory(trajectory.names, trajectory.world_from_camera, trajectory.registered, trajectory.source,
                           trajectory.covariance, 1.0, share)  # fmt: skip
-    for text, changed in _misreadings(trajectory):
+    for text, changed in misreadings(trajectory):
         other = _judge(changed, tracks, K)
         if other is not None and other[0] >= max(LEAST_SHARE, 2 * share):
             raise CaptureError(f"the poses that are given fit the images only read as {text}: give world_from_camera")
@@ -77,7 +77,7 @@ def _judge(trajectory: Trajectory, tracks: Tracks, K: Float[np.ndarray, "3 3"]) 
     return float(found.agreeing.sum() / asked.sum()), found.value  # a point behind its camera does not agree
 
 
-def _misreadings(trajectory: Trajectory) -> Sequence[tuple[str, Trajectory]]:
+def misreadings(trajectory: Trajectory) -> Sequence[tuple[str, Trajectory]]:
     """In words, and as they would be meant."""
     poses = trajectory.world_from_camera
     turned = poses.inverse()

@@ -43,7 +43,7 @@ def find_by_depth(
     Raises:
       CaptureError: too few do, or what was measured does not agree with them.
     """
-    edges = [edge for found in matches if (edge := _relate(found, features, K)) is not None]
+    edges = [edge for found in matches if (edge := relate(found, features, K)) is not None]
     poses, registered = _span(edges, len(names))
     check_registered(names, registered)
     joined = _only(join(features, matches), registered)
@@ -68,7 +68,7 @@ def find_by_depth(
     return Trajectory(tuple(names), known, registered, SOURCE, scale=1.0, agreement=share)
 
 
-def _relate(found: Match, features: Sequence[Features], K: Float[np.ndarray, "3 3"]) -> Edge | None:
+def relate(found: Match, features: Sequence[Features], K: Float[np.ndarray, "3 3"]) -> Edge | None:
     """The motion between two frames that most points agree on, whichever of the two has more depth."""
     import cv2
 

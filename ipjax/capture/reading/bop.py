@@ -35,7 +35,7 @@ def is_bop(folder: Path) -> bool:
     return (folder / "scene_camera.json").is_file()
 
 
-def open_bop(folder: Path, *, camera: Any, depth_scale: float | None, poses: bool, chosen: slice) -> Capture:
+def open_bop(folder: Path, *, camera: Any, depth_scale: float | int | None, poses: bool, chosen: slice) -> Capture:
     """A capture of this form; arguments and errors are `open_capture`'s."""
     path = folder / "scene_camera.json"
     try:

@@ -21,7 +21,8 @@ COLOURS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 DEPTHS = (".png", ".tif", ".tiff", ".npy")
 CAMERAS = ("camera.json", "camera.yaml", "camera.yml", "camera.txt", "cam_K.txt")
 CODE_UNIT = 0.0001  # metres per number, once the bits are back in their places
-_CODED = 0.999  # share of the numbers that must look coded
+_CHANGING = 0.05  # share of neighbouring numbers whose lowest three bits may differ, where they are the highest
+_HALL = 10_000  # numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +46,7 @@ class DepthForm:
     def to_metres(self, depth: np.ndarray) -> np.ndarray:
         """float32, metres, 0 = unknown."""
         if self.coded:
-            depth = (depth >> 3) | (depth << 13)
+            depth = turn_bits(depth)
         return to_metres(remove_sentinel(depth)[0], self.scale)
 
 
@@ -199,7 +200,7 @@ def pick_camera(folder: Path, camera: Any, names: Iterable[str] = CAMERAS) -> In
 
 
 def find_depth_form(
-    paths: Iterable[Path | None], camera: Intrinsics, scale: float | None, default: float | None = None
+    paths: Iterable[Path | None], camera: Intrinsics, scale: float | int | None, default: float | None = None
 ) -> DepthForm | None:
     """How depth becomes metres: as given, as the camera's file says, 1 for floats, or as the form has it.
 
@@ -227,13 +228,35 @@ def find_depth_form(
 
 
 def is_coded(path: Path) -> bool:
-    """Whether depth is stored with its bits turned by three places: the lowest three are the highest, mostly 0 or 1."""
+    """Whether depth is stored with its bits turned by three places, so that the lowest three are the highest.
+
+    These then hardly change from pixel to pixel, and where they do, it is the turned numbers that go on smoothly. Of a
+    scene that is all nearer than 0.8 m they are zero, and the numbers, as millimetres, would be of a hall.
+    """
     try:
         depth = read_depth(path)
     except ValueError as error:
         raise CaptureError(str(error)) from None
-    known = depth[depth > 0]
-    return bool(depth.dtype == np.uint16 and known.size and np.mean((known & 7) <= 2) > _CODED)
+    if depth.dtype != np.uint16:
+        return False
+    left, right = depth[:, :-1], depth[:, 1:]
+    both = (left > 0) & (right > 0)
+    changing = both & ((left & 7) != (right & 7))
+    if not both.any() or changing.sum() > _CHANGING * both.sum():
+        return False
+    if not changing.any():
+        known = depth[depth > 0]
+        return not (known & 7).any() and bool(np.median(known) > _HALL)
+    steps = [
+        np.median(np.abs(a[changing].astype(np.int64) - b[changing]))
+        for a, b in ((left, right), (turn_bits(left), turn_bits(right)))
+    ]
+    return bool(steps[1] < steps[0])
+
+
+def turn_bits(depth: np.ndarray) -> np.ndarray:
+    """uint16 with its bits turned back by three places."""
+    return (depth >> 3) | (depth << 13)
 
 
 def check_names(folder: Path, what: str, wanted: Iterable[str], there: Iterable[str]) -> None:

@@ -39,7 +39,7 @@ def is_frames(folder: Path) -> bool:
     return (folder / "rgb").is_dir()
 
 
-def open_frames(folder: Path, *, camera: Any, depth_scale: float | None, poses: bool, chosen: slice) -> Capture:
+def open_frames(folder: Path, *, camera: Any, depth_scale: float | int | None, poses: bool, chosen: slice) -> Capture:
     """A capture of this form; arguments and errors are `open_capture`'s."""
     colours = list_images(folder / "rgb", COLOURS)
     if not colours:

@@ -40,7 +40,7 @@ def is_numbered(folder: Path) -> bool:
     return any(folder.glob("*.color.*"))
 
 
-def open_numbered(folder: Path, *, camera: Any, depth_scale: float | None, poses: bool, chosen: slice) -> Capture:
+def open_numbered(folder: Path, *, camera: Any, depth_scale: float | int | None, poses: bool, chosen: slice) -> Capture:
     """A capture of this form; arguments and errors are `open_capture`'s."""
     found: dict[str, dict[str, Path]] = {"color": {}, "depth": {}, "pose": {}}
     for path in sorted(folder.iterdir()):

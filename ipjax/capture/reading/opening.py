@@ -24,7 +24,7 @@ def open_capture(
     *,
     form: str | None = None,
     camera: Any = None,
-    depth_scale: float | None = None,
+    depth_scale: float | int | None = None,
     poses: bool = True,
     every: int = 1,
 ) -> Capture:

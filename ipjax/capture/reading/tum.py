@@ -48,7 +48,7 @@ def is_tum(folder: Path) -> bool:
     return bool(images) and all(_as_time(name) is not None and "." in name for name in images)
 
 
-def open_tum(folder: Path, *, camera: Any, depth_scale: float | None, poses: bool, chosen: slice) -> Capture:
+def open_tum(folder: Path, *, camera: Any, depth_scale: float | int | None, poses: bool, chosen: slice) -> Capture:
     """A capture of this form; arguments and errors are `open_capture`'s."""
     if isinstance(camera, str) and camera in SEQUENCES:
         intrinsics = SEQUENCES[camera]

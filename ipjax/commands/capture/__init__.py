@@ -2,14 +2,15 @@
 
 from typing import Any
 
-from ipjax.commands.capture import pose, refine
+from ipjax.commands.capture import check, pose, refine
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (pose, refine)  # as --help lists them
+STEPS = (check, pose, refine)  # as --help lists them
 EXAMPLES = """\
 examples:
-  ipjax capture pose table/ -o work/       where the camera stood, frame by frame: work/poses.json
-  ipjax capture refine table/ -o work/     the same, made exact: work/refined.json
+  ipjax capture check table/ -o check.html     what it has, what is missing, and what looks wrong
+  ipjax capture pose table/ -o work/           where the camera stood, frame by frame: work/poses.json
+  ipjax capture refine table/ -o work/         the same, made exact: work/refined.json
 
 A capture is a folder of frames: rgb/NAME.png, depth/NAME.png (registered to the colours), camera.json, and, if they are
 known, poses.json and ignore.png (non-zero = moves with the camera); a TUM RGB-D sequence; or a scene of a BOP data set.
