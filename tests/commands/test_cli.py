@@ -41,7 +41,14 @@ def test_help_teaches_by_examples(name, capfd):
 
 @pytest.mark.parametrize(
     "words",
-    ["--version", "--help", *(f"{name} --help" for name in COMMANDS), "weights fetch --help", "capture pose --help"],
+    [
+        "--version",
+        "--help",
+        *(f"{name} --help" for name in COMMANDS),
+        "weights fetch --help",
+        "capture check --help",
+        "capture pose --help",
+    ],
 )
 def test_help_and_version_load_nothing_but_the_command(words):
     """A count, for time would depend on the machine: 97 modules where there once were 897."""
