@@ -92,7 +92,7 @@ def render_scene(
 
 
 def render_frames(
-    objects: Sequence[tuple[Mesh, Similarity]],
+    objects: Sequence[tuple[Mesh, Similarity[np.ndarray]]],
     camera: Camera,
     height: int,
     width: int,

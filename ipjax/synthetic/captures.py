@@ -124,7 +124,11 @@ def make_capture(
         shown = [(mesh, camera_from_world @ _repeat(pose, views)) for mesh, pose in world_from]
         shown += [(mesh, camera_from_rig @ still) for mesh in fingers]
         lamp = {"direction": camera_from_world.rotation @ down, **light}
-        told = None if progress is None else lambda now, _: progress(done + now, 2 * views)
+
+        def told(now: int, _: int) -> None:
+            if progress is not None:
+                progress(done + now, 2 * views)
+
         width, height = pixels
         return render_frames(
             shown, pinhole, height, width, light=lamp, oversample=oversample, backend=backend, progress=told
@@ -136,7 +140,7 @@ def make_capture(
     raw = np.stack([sense_depth(rng, depth, depth_camera, sensor) for depth in beside.depth])
     raw[:, :, : round(_BAND * depth_size[0])] = 0
     error = factory_error * rng.normal(0, [0.0045] * 3 + [0.002] * 3)
-    factory = colour_from_depth @ Similarity.exp(error)
+    factory = colour_from_depth @ Similarity[np.ndarray].exp(error)
     factory_depth_camera = Camera(
         depth_camera.focal * jnp.float32(1 + factory_error * rng.normal(0, 0.004)), depth_camera.centre
     )

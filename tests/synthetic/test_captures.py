@@ -1,10 +1,11 @@
 """Made captures: the truth that comes with them is true, the light hangs in the room, and what is written hides it."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ipjax.cameras import project, unproject
 from ipjax.files.images.depth import read_depth
@@ -65,13 +66,13 @@ def test_objects_are_where_the_truth_has_them(capture):
         assert len(points) > 100
         inside = pose.inverse() @ (at(capture.world_from_camera, 1) @ points)
         near = np.concatenate([mesh.vertices, mesh.vertices[mesh.faces].mean(1)])
-        distance, _ = cKDTree(near).query(inside)
+        distance, _ = KDTree(near).query(inside)
         assert np.quantile(distance, 0.95) < 0.04  # of the diameter: vertices are at most 0.06 apart
 
 
 def test_touching_objects_touch_and_others_do_not(capture):
     clouds = [at(capture.world_from_object, i) @ mesh.vertices for i, mesh in enumerate(capture.meshes)]
-    gap = lambda a, b: cKDTree(clouds[a][:, :2]).query(clouds[b][:, :2])[0].min()
+    gap = lambda a, b: KDTree(clouds[a][:, :2]).query(clouds[b][:, :2])[0].min()
     assert gap(0, 1) < 0.012 and min(gap(0, 2), gap(1, 2)) > 0.025
     assert all(cloud[:, 2].min() == pytest.approx(0, abs=1e-6) for cloud in clouds)
 
@@ -121,10 +122,11 @@ def test_written_captures_hold_no_truth(capture, tmp_path):
 
 
 def test_refuses_what_is_no_capture():
-    for arguments, said in (
-        ({"views": 1}, "two views or more"),
-        ({"objects": 0}, "at least one object"),
-        ({"objects": 2, "sizes": (0.1,)}, "as many positive sizes"),
-    ):
+    faults: dict[str, dict[str, Any]] = {
+        "two views or more": {"views": 1},
+        "at least one object": {"objects": 0},
+        "as many positive sizes": {"objects": 2, "sizes": (0.1,)},
+    }
+    for said, arguments in faults.items():
         with pytest.raises(ValueError, match=said):
             make_capture(0, **arguments)

@@ -61,11 +61,11 @@ class EdgeCorrelation:
         """The best shift; None where there are too few outlines."""
         if sum(self._weights) < _FEWEST or min(self._weights) <= 0:
             return None
+        weights = np.array(self._weights)
         maps = [
-            cv2.GaussianBlur(total / weight, (0, 0), 1.0)
-            for total, weight in zip(self._sums, self._weights, strict=True)
+            cv2.GaussianBlur(total / weight, (0, 0), 1.0) for total, weight in zip(self._sums, weights, strict=True)
         ]
-        both = sum(weight * image for weight, image in zip(self._weights, maps, strict=True)) / sum(self._weights)
+        both = np.tensordot(weights / weights.sum(), np.stack(maps), 1)
         across, down = _find_peak(both)
         spread = 1.4826 * np.median(np.abs(both - np.median(both)))
         here = both[_REACH - 1 : _REACH + 2, _REACH - 1 : _REACH + 2].max()

@@ -86,7 +86,7 @@ def test_poses_of_another_form_are_told(capture):
     other_axes = dataclasses.replace(capture, world_from_camera=capture.world_from_camera @ flip)
     assert "OpenGL" in told(other_axes, UNUSABLE)["poses"].text
     rng = np.random.default_rng(0)
-    shaken = capture.world_from_camera @ Similarity.exp(rng.normal(0, [0.05] * 3 + [0.05] * 3, (6, 6)))
+    shaken = capture.world_from_camera @ Similarity[np.ndarray].exp(rng.normal(0, [0.05] * 3 + [0.05] * 3, (6, 6)))
     found = list_findings(inspect(dataclasses.replace(capture, world_from_camera=shaken)))
     assert any("do not belong together" in f.text for f in found if f.topic == "poses" and f.kind != FACT)
     none = told(dataclasses.replace(capture, world_from_camera=None), FACT)

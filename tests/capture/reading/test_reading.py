@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from typing import Any
 
 import cv2
 import numpy as np
@@ -267,11 +268,12 @@ def test_a_frame_that_breaks_later_is_named(folder, tmp_path):
     (here / "depth" / "000001.png").unlink()
     with pytest.raises(CaptureError, match=r"000001\.png: no such file"):
         capture.read_frame(1)
-    for arguments, said in (
-        ({"form": "other"}, "no form"),
-        ({"every": 0}, "every 0-th"),
-        ({"depth_scale": 0.0}, "positive"),
-    ):
+    faults: dict[str, dict[str, Any]] = {
+        "no form": {"form": "other"},
+        "every 0-th": {"every": 0},
+        "positive": {"depth_scale": 0.0},
+    }
+    for said, arguments in faults.items():
         with pytest.raises(CaptureError, match=said):
             open_capture(here, **arguments)
     with pytest.raises(CaptureError, match="no such folder"):
