@@ -37,7 +37,7 @@ class Board:
     dictionary: str  # by OpenCV's name
 
     def make(self) -> Any:
-        """OpenCV's own."""
+        """The board as OpenCV describes it."""
         import cv2
 
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))

@@ -13,8 +13,8 @@ def add_capture(parser: Any) -> None:
     """The folder, and what it does not say itself."""
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="the capture")
     parser.add_argument("--form", choices=FORMS, help="its form, where the folder does not show it")
-    parser.add_argument("--camera", metavar="FILE|fx,fy,cx,cy", help="of the colours (default: the folder's own)")
-    parser.add_argument("--depth-scale", type=float, metavar="X", help="metres per number of the depth images")
+    parser.add_argument("--camera", metavar="FILE", help="BOP JSON, ROS CameraInfo, or fx,fy,cx,cy (default: its own)")
+    parser.add_argument("--depth-scale", type=float, metavar="S", help="metres per depth unit, e.g. 0.001")
     parser.add_argument("--every", type=parse_count, default=1, metavar="N", help="take each N-th frame only")
 
 
