@@ -144,7 +144,7 @@ def make_capture(
     factory_depth_camera = Camera(
         depth_camera.focal * jnp.float32(1 + factory_error * rng.normal(0, 0.004)), depth_camera.centre
     )
-    registered = [_register(depth, factory_depth_camera, factory, camera, size) for depth in raw]
+    registered = [register_depth(depth, factory_depth_camera, factory, camera, size) for depth in raw]
     if seen.ids is None:
         raise RuntimeError("the renderer returned no segmentation")
     ids = np.where(seen.ids >= len(objects), np.where(seen.ids >= len(world_from), -2, -1), seen.ids)
@@ -291,7 +291,7 @@ def _stack(poses: Sequence[Similarity[np.ndarray]]) -> Similarity[np.ndarray]:
     return Similarity(*(np.stack([getattr(p, x) for p in poses]) for x in ("rotation", "translation", "scale")))
 
 
-def _register(
+def register_depth(
     depth: np.ndarray,
     depth_camera: Camera,
     colour_from_depth: Similarity[np.ndarray],

@@ -2,15 +2,17 @@
 
 from typing import Any
 
-from ipjax.commands.capture import check, pose, refine
+from ipjax.commands.capture import check, label, model, pose, refine
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (check, pose, refine)  # as --help lists them
+STEPS = (check, pose, refine, model, label)  # as --help lists them
 EXAMPLES = """\
 examples:
   ipjax capture check table/ -o check.html     what it has, what is missing, and what looks wrong
   ipjax capture pose table/ -o work/           where the camera stood, frame by frame: work/poses.json
   ipjax capture refine table/ -o work/         the same, made exact: work/refined.json
+  ipjax capture model table/ -o work/          models of what stands on the table: work/models/
+  ipjax capture label table/ -o work/          masks, boxes and poses of every frame, in BOP's layout: work/dataset/
 
 A capture is a folder of frames: rgb/NAME.png, depth/NAME.png (registered to the colours), camera.json, and, if they are
 known, poses.json and ignore.png (non-zero = moves with the camera); a TUM RGB-D sequence; or a scene of a BOP data set.

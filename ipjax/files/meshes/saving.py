@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Float, UInt8
+
 from ipjax.files.meshes.formats.gltf_writing import make_glb
 from ipjax.files.meshes.mesh import Mesh
 from ipjax.files.storage.writing import write_bytes, write_text
@@ -39,3 +42,33 @@ def save_mesh(mesh: Mesh, path: str | Path) -> None:
         return
     data = out.export(file_type=kind[1:])
     write_bytes(path, data if isinstance(data, bytes) else str(data).encode())
+
+
+def save_points(
+    path: str | Path,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    colours: UInt8[np.ndarray, "n 3"],
+) -> None:
+    """Write a cloud of points with normals and colours as binary PLY; positions are float32.
+
+    Raises:
+      ValueError: the name does not end in .ply.
+      OSError: the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise ValueError(f"{path.name}: clouds of points are written as .ply")
+    kinds = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
+        (c, "u1") for c in ("red", "green", "blue")
+    ]
+    rows = np.zeros(len(points), kinds)
+    for k in range(3):
+        rows["xyz"[k]], rows["n" + "xyz"[k]], rows[("red", "green", "blue")[k]] = (
+            points[:, k],
+            normals[:, k],
+            colours[:, k],
+        )
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    head += [f"property {'uchar' if kind == 'u1' else 'float'} {name}" for name, kind in kinds]
+    write_bytes(path, ("\n".join([*head, "end_header"]) + "\n").encode() + rows.tobytes())

@@ -1,0 +1,148 @@
+"""Masks of every frame: the models drawn where they stand, and what the frame itself says of their borders."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ipjax.cameras import crop, project
+from ipjax.capture.models.frames import PosedFrame
+from ipjax.capture.models.making import ObjectModel
+from ipjax.records import Camera
+from ipjax.rendering.render import render_each, render_frames
+from ipjax.transforms import Similarity
+
+_HIDES = 0.015  # metres by which what is measured must be nearer than the model to hide it
+_BEHIND = 0.02  # … or farther for the model not to be there
+
+
+@dataclasses.dataclass(frozen=True)
+class FrameLabels:
+    """What is known of one frame, an entry for every model."""
+
+    camera_from_model: tuple[Similarity[np.ndarray], ...]
+    whole: Bool[np.ndarray, "n h w"]  # the model drawn alone
+    visible: Bool[np.ndarray, "n h w"]
+    drawn: tuple[int, ...]  # pixels of the whole silhouette, those outside the image included
+    box: tuple[tuple[int, int, int, int], ...]  # x, y, width, height of the whole silhouette; −1 where there is none
+    depth: Float[np.ndarray, "h w"]  # of all models together, metres; 0 = none
+
+    @property
+    def shares(self) -> Float[np.ndarray, " n"]:
+        """Visible share of every silhouette."""
+        return self.visible.sum((1, 2)) / np.maximum(self.drawn, 1)
+
+    @property
+    def visible_boxes(self) -> list[tuple[int, int, int, int]]:
+        """Tight boxes of what is visible: x, y, width, height; −1 where nothing is."""
+        return [find_box(mask) for mask in self.visible]
+
+
+def label_frames(
+    models: Sequence[ObjectModel],
+    frames: Sequence[PosedFrame],
+    *,
+    backend: str = "auto",
+    progress: Callable[[int, int], None] | None = None,
+) -> list[FrameLabels]:
+    """Masks and boxes of all models in all frames.
+
+    Raises:
+      ValueError: no models.
+      RenderError: nothing can draw, with a given `backend`.
+    """
+    if not models:
+        raise ValueError("there is nothing to label: no models")
+    first = frames[0]
+    width, height = first.size
+    camera_from_world = [frame.camera_from_world for frame in frames]
+    poses = [[pose @ model.world_from_model for model in models] for pose in camera_from_world]
+    # A silhouette that leaves the image is drawn whole on a larger canvas, up to three times the image.
+    most = np.max([_find_overhang(frame, row, models) for frame, row in zip(frames, poses, strict=True)], axis=0)
+    rim = np.minimum(most, (width, height)).astype(int).tolist()
+    camera = Camera.from_matrix(first.camera)
+    wide = Camera.from_matrix(crop(first.camera, (-rim[0], -rim[1])))
+    together = render_frames(
+        [(model.mesh, _stack([row[k] for row in poses])) for k, model in enumerate(models)],
+        camera,
+        height,
+        width,
+        oversample=1,
+        backend=backend,
+    )
+    alone = render_each(
+        [model.mesh for model in models],
+        list(range(len(models))) * len(frames),
+        _stack([pose for row in poses for pose in row]),
+        wide,
+        height + 2 * rim[1],
+        width + 2 * rim[0],
+        backend=backend,
+    )
+    assert together.ids is not None
+    found = []
+    for number, frame in enumerate(frames):
+        silhouettes = alone.depth[number * len(models) : (number + 1) * len(models)] > 0
+        whole = silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width]
+        boxes = []
+        for mask in silhouettes:
+            x, y, w, h = find_box(mask)
+            boxes.append((x - rim[0], y - rim[1], w, h) if w > 0 else (-1, -1, -1, -1))
+        ids, drawn = together.ids[number], together.depth[number]
+        ids = settle(ids, drawn, frame)
+        visible = np.stack([ids == k for k in range(len(models))])
+        found.append(
+            FrameLabels(
+                tuple(poses[number]),
+                whole | visible,
+                visible,
+                tuple(int(v) for v in np.maximum(silhouettes.sum((1, 2)), (whole | visible).sum((1, 2)))),
+                tuple(boxes),
+                drawn,
+            )
+        )
+        if progress is not None:
+            progress(number + 1, len(frames))
+    return found
+
+
+def settle(ids: np.ndarray, drawn: Float[np.ndarray, "h w"], frame: PosedFrame) -> np.ndarray:
+    """Which model each pixel shows, −1 = none, where the frame has been heard: what is measured in front hides, what is
+    measured far behind shows that the model is not there.
+    """
+    import cv2
+
+    known = (frame.depth > 0) & (ids >= 0)
+    kernel = np.ones((3, 3), np.uint8)
+    # Single pixels are noise, and those beside an edge may have the depth of either side.
+    hidden = cv2.morphologyEx((known & (frame.depth < drawn - _HIDES)).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+    absent = cv2.morphologyEx((known & (frame.depth > drawn + _BEHIND)).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+    return np.where(hidden | absent | ~frame.usable, -1, ids)
+
+
+def find_box(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
+    """The tight box of a mask: x, y, width, height; −1 four times where it is empty."""
+    columns, rows = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
+    if not len(columns):
+        return (-1, -1, -1, -1)
+    return int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+
+
+def _find_overhang(
+    frame: PosedFrame, poses: Sequence[Similarity[np.ndarray]], models: Sequence[ObjectModel]
+) -> Float[np.ndarray, "2"]:
+    """Pixels by which the models' vertices leave the image, in x and in y."""
+    size = np.array(frame.size)
+    most = np.zeros(2)
+    for pose, model in zip(poses, models, strict=True):
+        points = pose @ model.mesh.vertices
+        points = points[points[:, 2] > 0.05]
+        if len(points):
+            pixels = project(frame.camera, points)
+            most = np.maximum(most, np.maximum(-0.5 - pixels.min(0), pixels.max(0) - size + 0.5))
+    return np.ceil(most)
+
+
+def _stack(poses: Sequence[Similarity[np.ndarray]]) -> Similarity[np.ndarray]:
+    return Similarity(*(np.stack([getattr(p, part) for p in poses]) for part in ("rotation", "translation", "scale")))

@@ -1,0 +1,161 @@
+"""Which parts of the scene's surface are objects: what stands on the support, apart from what stands beside it."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ipjax.cameras import project, unproject
+from ipjax.capture.models.frames import PosedFrame
+from ipjax.capture.models.splitting import Seams, make_affinity, split_alone, split_by_seeds
+from ipjax.capture.models.support import Support
+from ipjax.capture.models.surfaces import cut, number_pieces
+from ipjax.capture.records import CaptureError
+from ipjax.files.meshes.mesh import Mesh, corner_products
+
+_SEED = 0.008  # metres about a clicked point that are surely the object's
+_NEAR = 0.02  # metres from the surface within which a click is on it
+_HIDDEN = 0.01  # metres behind what a frame measured, at which it does not see a point
+_FOOT = 0.01  # metres above the support: what is lower is where a thing stands
+
+
+@dataclasses.dataclass(frozen=True)
+class Hint:
+    """What a person says of an object: a pixel that shows it, or a box around it, in one frame."""
+
+    name: str
+    frame: str | None  # the frame's name; None = the first
+    x: float
+    y: float
+    right: float | None = None  # of a box, whose left upper corner is (x, y)
+    bottom: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of the surface that is one object."""
+
+    name: str
+    mesh: Mesh  # in world
+    hinted: bool
+
+
+def separate(
+    surface: Mesh,
+    support: Support,
+    frames: Sequence[PosedFrame],
+    hints: Sequence[Hint] = (),
+    *,
+    cut_at: float,
+    least_area: float,
+    least_height: float,
+    seams: Seams,
+    alone: bool = True,
+) -> list[Part]:
+    """The objects on the support, those that were hinted at first, the others from the largest to the smallest.
+
+    Args:
+      surface: of the scene, in world.
+      hints: where several are on one connected piece, it is divided among them.
+      cut_at: metres above the support below which the surface is the support's.
+      least_area: metres²: pieces with less are no objects.
+      least_height: metres that an object rises above the support.
+      alone: also divide pieces that no hint divides.
+
+    Raises:
+      CaptureError: nothing stands there, or a hint is not on anything that does.
+    """
+    above = support.heights(surface.vertices) > cut_at
+    inside = above & support.covers(surface.vertices)
+    keep = inside[surface.faces].all(1)
+    if not keep.any():
+        raise CaptureError("nothing stands on the support: no surface rises above the table")
+    rest = cut(surface, keep)
+    piece = number_pieces(len(rest.vertices), rest.faces)
+    share = np.linalg.norm(corner_products(rest.vertices, rest.faces), axis=-1) / 2
+    area = np.bincount(piece[rest.faces[:, 0]], share, piece.max() + 1)
+    height = np.zeros(len(area))
+    np.maximum.at(height, piece, support.heights(rest.vertices))
+    candidates = np.flatnonzero((area > least_area) & (height > least_height))
+    if not len(candidates):
+        raise CaptureError("nothing that stands on the support is large enough to be an object")
+    seeds = [_place_hint(hint, frames, rest, np.isin(piece, candidates)) for hint in hints]
+    parts: list[tuple[float, Part]] = []
+    for number in candidates:
+        mine = np.flatnonzero(piece == number)
+        mesh = cut(rest, piece[rest.faces[:, 0]] == number)  # keeps the vertices' order
+        place = np.full(len(rest.vertices), -1)
+        place[mine] = np.arange(len(mine))
+        here = [(k, place[seed][place[seed] >= 0]) for k, seed in enumerate(seeds)]
+        here = [(k, seed) for k, seed in here if len(seed) > 0.5 * len(seeds[k])]
+        if len(here) > 1:
+            label = split_by_seeds(make_affinity(mesh, seams), [seed for _, seed in here])
+        elif not here and alone:
+            stands = support.heights(mesh.vertices) < _FOOT
+            label = split_alone(make_affinity(mesh, seams), stands, least_area=least_area)
+        else:
+            label = np.zeros(len(mesh.vertices), int)
+        for value in range(label.max() + 1):
+            faces = (label[mesh.faces] == value).sum(1) >= 2
+            if not faces.any():
+                continue
+            hinted = value < len(here)
+            size = float(area[number] * faces.mean())
+            name = hints[here[value][0]].name if hinted else ""
+            order = -1e6 + here[value][0] if hinted else -size
+            parts.append((order, Part(name, cut(mesh, faces), hinted)))
+    parts.sort(key=lambda item: item[0])
+    taken, found = {hint.name for hint in hints}, []
+    for _, part in parts:
+        if not part.name:
+            free = next(f"object_{k}" for k in range(1, len(parts) + len(taken) + 1) if f"object_{k}" not in taken)
+            taken.add(free)
+            part = dataclasses.replace(part, name=free)
+        found.append(part)
+    return found
+
+
+def _place_hint(hint: Hint, frames: Sequence[PosedFrame], mesh: Mesh, allowed: np.ndarray) -> Int[np.ndarray, " k"]:
+    """Vertices that a hint surely means."""
+    frame = frames[0] if hint.frame is None else next((f for f in frames if f.name == hint.frame), None)
+    if frame is None:
+        raise CaptureError(f"{hint.name}: no frame with a pose is called {hint.frame}")
+    seen, pixels = _see(frame, mesh)
+    seen &= allowed
+    if hint.right is not None and hint.bottom is not None:
+        middle = np.array([(hint.x + hint.right) / 2, (hint.y + hint.bottom) / 2])
+        half = np.array([hint.right - hint.x, hint.bottom - hint.y]) / 2
+        inner = seen & (np.abs(pixels - middle) < 0.5 * half).all(1)
+        if not inner.any():
+            raise CaptureError(
+                f"{hint.name}: the box in frame {frame.name} is around nothing that stands on the support"
+            )
+        return np.flatnonzero(inner)
+    width, height = frame.size
+    column, row = round(hint.x), round(hint.y)
+    if not (0 <= column < width and 0 <= row < height):
+        raise CaptureError(f"{hint.name}: the click ({hint.x:g}, {hint.y:g}) is outside of {width} × {height} pixels")
+    patch = frame.depth[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4]
+    if not (patch > 0).any():
+        raise CaptureError(f"{hint.name}: frame {frame.name} has no depth where ({hint.x:g}, {hint.y:g}) was clicked")
+    point = unproject(frame.camera, np.array([[hint.x, hint.y]], float), np.array([np.median(patch[patch > 0])]))
+    distance = np.linalg.norm(mesh.vertices - frame.world_from_camera @ point, axis=-1)
+    distance[~allowed] = np.inf
+    if distance.min() > _NEAR:
+        raise CaptureError(
+            f"{hint.name}: ({hint.x:g}, {hint.y:g}) in frame {frame.name} is {100 * distance.min():.0f} cm from "
+            "anything that stands on the support"
+        )
+    return np.flatnonzero(distance < max(_SEED, distance.min() + 0.002))
+
+
+def _see(frame: PosedFrame, mesh: Mesh) -> tuple[np.ndarray, Float[np.ndarray, "n 2"]]:
+    """Which vertices a frame sees, and their pixels."""
+    points = frame.camera_from_world @ mesh.vertices
+    pixels = project(frame.camera, points)
+    column, row = np.rint(pixels).astype(int).T
+    width, height = frame.size
+    inside = (points[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    measured = frame.depth[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return inside & (measured > 0) & (points[:, 2] < measured + _HIDDEN), pixels

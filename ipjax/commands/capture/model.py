@@ -1,0 +1,153 @@
+"""``ipjax capture model``: what stands on the table?"""
+
+import argparse
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from ipjax.commands.capture.bars import Bars
+from ipjax.commands.capture.opening import add_capture, open_given
+from ipjax.commands.interface import options
+from ipjax.commands.interface.messages import Messages
+from ipjax.commands.interface.parser import add_command
+
+EXAMPLES = """\
+examples:
+  ipjax capture model table/ -o work/
+  ipjax capture model table/ -o work/ --click mug:312,204 --click box:420,233@000007
+  ipjax capture model table/ -o work/ --box mug:280,160,70,90 --voxel 1.5 --close
+
+Objects are what stands on the table, apart from one another. Those that touch are told apart by the creases between
+them, or by a click (or a box) on each in one frame: NAME:X,Y, or NAME:X,Y@FRAME where it is not the first.
+
+Reads WORK/refined.json or WORK/poses.json, and WORK/depth/, if the step depth made it. Writes WORK/models/: NAME.ply
+and NAME_points.ply of each object, scene.ply and scene_points.ply, models.json; and the picture WORK/models.png.
+"""
+
+
+def add(steps: Any) -> None:
+    """The step and its options."""
+    parser = add_command(steps, "model", run, "make models of the objects and of the scene", EXAMPLES)
+    add_capture(parser)
+    options.add_output(parser, "WORK", "folder of what the steps make", required=True)
+    parser.add_argument("--click", action="append", type=_parse_click, metavar="NAME:X,Y", help="an object, by a pixel")
+    parser.add_argument("--box", action="append", type=_parse_box, metavar="NAME:X,Y,W,H", help="an object, by a box")
+    parser.add_argument("--voxel", type=float, default=2.0, metavar="MM", help="of the objects (default 2)")
+    parser.add_argument("--close", action="store_true", help="close the bottoms, on which the objects stand")
+    parser.add_argument("--together", action="store_true", help="do not divide what touches without being told")
+    parser.add_argument(
+        "--shape-symmetries", action="store_true", help="symmetric is what the shape, not the colour, is"
+    )
+    add_again(parser)
+    options.add_reporting(parser, quiet="no progress bar")
+
+
+def add_again(parser: Any) -> None:
+    """``--again``: a step whose result is there is not repeated otherwise."""
+    parser.add_argument("--again", action="store_true", help="even if what is there was made of the same")
+
+
+def run(arguments: argparse.Namespace, messages: Messages) -> int:
+    """Make the models and write them; returns the exit status."""
+    from ipjax.capture.labels.pictures import draw_models
+    from ipjax.capture.models.making import ModelConfig, make_models
+    from ipjax.capture.models.storing import read_made_of, write_models
+    from ipjax.inference.compilation_cache import use_compilation_cache
+    from ipjax.inference.drawing import write_image
+
+    work: Path = options.check_folder(arguments.output)
+    if not 0.3 <= arguments.voxel <= 20:
+        raise ValueError(f"--voxel is in millimetres, from 0.3 to 20, not {arguments.voxel:g}")
+    hints = [*(arguments.click or ()), *(arguments.box or ())]
+    frames = open_frames(arguments, work)
+    config = ModelConfig(
+        voxel=arguments.voxel / 1000,
+        alone=not arguments.together,
+        close=arguments.close,
+        colour_symmetries=not arguments.shape_symmetries,
+    )
+    made_of = describe_inputs(arguments, work, {"config": repr(config), "hints": repr(hints)})
+    folder = work / "models"
+    if read_made_of(folder) == made_of and not arguments.again:
+        messages.say(f"{folder} was made of the same already; --again makes it once more.")
+        messages.finish({"models": str(folder), "made": False})
+        return 0
+    use_compilation_cache()
+    with Bars(quiet=arguments.quiet) as bars:
+        found = make_models(frames, hints, config, progress=bars.show)
+    write_models(folder, found, made_of)
+    write_image(work / "models.png", draw_models(found.objects))
+    for line in found.notes:
+        messages.say(f"{line[0].upper()}{line[1:]}.")
+    messages.finish(
+        {
+            "models": str(folder),
+            "made": True,
+            "objects": [item.name for item in found.objects],
+            "notes": list(found.notes),
+        }
+    )
+    return 0
+
+
+def open_frames(arguments: argparse.Namespace, work: Path) -> Any:
+    """The frames of the capture with the best poses and depth that the steps before left in the folder."""
+    from ipjax.capture.models.frames import CaptureFrames
+    from ipjax.capture.records import CaptureError
+    from ipjax.capture.trajectories import read_trajectory
+    from ipjax.files.images.masks import read_mask
+
+    capture = open_given(arguments, poses=False)
+    found = find_poses(work)
+    if found is None:
+        raise CaptureError(f"{work}: it has no poses.json; make it with ipjax capture pose")
+    folder, hidden = work / "depth", work / "ignore.png"
+    ignore = read_mask(hidden) if hidden.is_file() else None
+    if ignore is not None and ignore.shape != capture.size[::-1]:
+        raise CaptureError(f"{hidden}: it is of another size than the frames, {capture.size[0]} × {capture.size[1]}")
+    return CaptureFrames(capture, read_trajectory(found), folder if folder.is_dir() else None, ignore)
+
+
+def find_poses(work: Path) -> Path | None:
+    """The refined poses where they are, else the first ones."""
+    return next((path for path in (work / "refined.json", work / "poses.json") if path.is_file()), None)
+
+
+def describe_inputs(arguments: argparse.Namespace, work: Path, about: dict[str, Any]) -> str:
+    """A word that is another whenever the capture, the poses, the depth or the settings are."""
+    files = [path for path in (find_poses(work), work / "ignore.png") if path is not None and path.is_file()]
+    texts = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    lists = {}
+    for folder in (arguments.folder, work / "depth"):
+        if folder.is_dir():
+            entries = sorted(p for p in folder.rglob("*") if p.is_file())
+            lists[str(folder.name)] = [
+                (str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in entries
+            ]
+    told = [arguments.form, arguments.camera, arguments.depth_scale, arguments.every, texts, lists, about]
+    return hashlib.sha256(json.dumps(told).encode()).hexdigest()
+
+
+def _parse_click(text: str) -> Any:
+    return _parse_hint(text, 2, "NAME:X,Y, for instance mug:312,204 or mug:312,204@000007")
+
+
+def _parse_box(text: str) -> Any:
+    return _parse_hint(text, 4, "NAME:X,Y,W,H, for instance mug:280,160,70,90 or mug:280,160,70,90@000007")
+
+
+def _parse_hint(text: str, count: int, form: str) -> Any:
+    from ipjax.capture.models.separation import Hint
+
+    found = re.fullmatch(r"(?P<name>[^:@]+):(?P<numbers>[-\d.,]+)(@(?P<frame>.+))?", text)
+    try:
+        numbers = [float(part) for part in found["numbers"].split(",")] if found else []
+    except ValueError:
+        numbers = []
+    if found is None or len(numbers) != count:
+        raise argparse.ArgumentTypeError(f"{text!r} is no hint: give {form}")
+    x, y = numbers[:2]
+    box = {} if count == 2 else {"right": x + numbers[2], "bottom": y + numbers[3]}
+    return Hint(found["name"], found["frame"], x, y, **box)
