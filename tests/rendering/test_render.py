@@ -8,7 +8,7 @@ import trimesh
 from ipjax.files.meshes.mesh import make_mesh, normalise
 from ipjax.onboarding.viewpoints import viewpoints
 from ipjax.records import Camera, Similarity
-from ipjax.rendering.render import available_backends, render, render_each, render_scene
+from ipjax.rendering.render import available_backends, render, render_each, render_frames, render_scene
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +160,36 @@ def test_scenes_have_instances_and_occlusion(backend):
     light["direction"] = [1.0, 0, 0]
     side = render_scene(turned, camera(50, 50, 19.5, 19.5), 40, 40, backend=backend, light=light)
     assert np.abs(side.rgb[0, 20, 20].astype(int) - [4, 45, 100]).max() <= 3
+
+
+def test_frames_of_a_scene_are_those_drawn_alone_each_under_its_own_light(backend):
+    facing = np.diag([1.0, -1.0, -1.0])
+    places = np.array([[0, 0, 2.0], [0.3, 0, 1.5]])
+    poses = Similarity(np.stack([facing, facing]), places, np.ones(2))
+    light = {"direction": np.array([[0, 0, 1.0], [1.0, 0, 1.0]]), "ambient": 0.3, "diffuse": 0.6}
+    heard = []
+    frames = render_frames(
+        [(checker(), poses)],
+        camera(50, 50, 19.5, 19.5),
+        40,
+        40,
+        backend=backend,
+        light=light,
+        progress=lambda done, total: heard.append((done, total)),
+    )
+    assert frames.ids is not None and heard == [(1, 2), (2, 2)]
+    for index, place in enumerate(places):
+        alone = {**light, "direction": light["direction"][index]}
+        objects = [(checker(), pose(facing, place))]
+        image = render_scene(objects, camera(50, 50, 19.5, 19.5), 40, 40, backend=backend, light=alone)
+        assert image.ids is not None
+        np.testing.assert_array_equal(frames.rgb[index], image.rgb[0])
+        np.testing.assert_allclose(frames.depth[index], image.depth[0], atol=1e-6)
+        np.testing.assert_array_equal(frames.ids[index], image.ids[0])
+    assert frames.rgb[0].max() > frames.rgb[1].max() + 20
+    growing = Similarity(poses.rotation, poses.translation, np.array([1.0, 1.1]))
+    with pytest.raises(ValueError, match="keeps its size"):
+        render_frames([(checker(), growing)], camera(50, 50, 19.5, 19.5), 40, 40, backend=backend)
 
 
 def test_one_triangle_and_nothing_in_view(backend):
