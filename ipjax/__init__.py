@@ -25,7 +25,8 @@ if TYPE_CHECKING:
         ScoreConfig,
     )
     from ipjax.detection.detector import Detector
-    from ipjax.detection.records import Detection, Detections
+    from ipjax.detection.explanation.page import explain
+    from ipjax.detection.records import Detection, Detections, Reason, Rejected
     from ipjax.estimation.features import describe, observe
     from ipjax.estimation.pipeline import estimate
     from ipjax.files.cameras.intrinsics import Intrinsics
@@ -73,8 +74,10 @@ __all__ = [
     "Patches",
     "PoseEstimate",
     "Query",
+    "Reason",
     "ReferenceView",
     "RefineConfig",
+    "Rejected",
     "ResectConfig",
     "ScoreConfig",
     "Similarity",
@@ -87,6 +90,7 @@ __all__ = [
     "draw",
     "estimate",
     "evaluate",
+    "explain",
     "frame",
     "frame_turned",
     "load",
@@ -133,9 +137,12 @@ _HOMES = {
         "ScoreConfig",
     ),
     "detection.detector": ("Detector",),
+    "detection.explanation.page": ("explain",),
     "detection.records": (
         "Detection",
         "Detections",
+        "Reason",
+        "Rejected",
     ),
     "estimation.features": (
         "describe",

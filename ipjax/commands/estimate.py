@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ipjax.commands.interface import options
-from ipjax.commands.interface.candidates import MOST, check_any, estimate_best
+from ipjax.commands.interface.candidates import MOST, estimate_best
+from ipjax.commands.interface.checks import check, check_objects, read_first
 from ipjax.commands.interface.detection import (
     Found,
     detect_frame,
@@ -18,12 +19,13 @@ from ipjax.commands.interface.detection import (
 from ipjax.commands.interface.frames import FrameFiles, Images, choose_masks, list_frames, read_frame
 from ipjax.commands.interface.messages import Messages, in_one_line
 from ipjax.commands.interface.outputs import compare_photos, draw_frame, mesh_paths, write_mesh
-from ipjax.commands.interface.parser import add_command, parse_count
+from ipjax.commands.interface.parser import add_command, parse_click, parse_count
 
 EXAMPLES = """\
 examples:
   ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json -o pose.json --overlay out.png
   ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json --instances all
+  ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --click 312,240 --explain why.html
   ipjax estimate mug.ipjax --rgb rgb.png --depth depth.png --camera camera.json --mask mask.png -o pose.json
   ipjax estimate mug.ipjax box.ipjax --rgb rgb.png --depth depth.png --camera camera.json \\
       --mask mug.png --mask box.png --overlay out.png       several objects: one mask (or box) each, in their order
@@ -34,7 +36,8 @@ examples:
 
 Without a mask or a box the objects are sought: the image is cut up by depth and colour into pieces that may be things,
 those most like an object are estimated, and the mask is taken from the surest pose. --instances says how many of each.
-A mask, a box, and a known size (--diameter) make it surer; --mask-is-rough mends a mask that is too wide, or cut off.
+A mask, a box, a click on it (--click X,Y) and a known size (--diameter) make it surer; --explain writes a page of what
+was tried and why it was rejected. --mask-is-rough mends a mask that is too wide, or cut off.
 
 A mask is an image of any kind, or a file of detections: JSON of BOP, COCO, SAM or Grounded-SAM, npz of CNOS or SAM-6D,
 a stack of masks as npy, an image of labels. Of several masks without a class each is tried, and the one of highest
@@ -60,8 +63,6 @@ would have seen it, beside the photo (which may have had depth): where the pose 
 depth, --mesh-out has, in place of the front that was guessed, the one that was measured.
 """
 
-MESHES = (".ply", ".glb", ".obj", ".stl")
-
 
 def add(commands: Any) -> None:
     """The command and its options."""
@@ -76,6 +77,13 @@ def add(commands: Any) -> None:
         "the object's visible pixels: an image, npy, or detections (JSON, npz)",
         "instead of a mask, pixels",
         many=True,
+    )
+    parser.add_argument(
+        "--click",
+        type=parse_click,
+        metavar="X,Y",
+        action="append",
+        help="a pixel that shows the object: it is sought only there; one for each object",
     )
     parser.add_argument("--frames", type=Path, metavar="FOLDER", help="a folder of frames instead of a single one")
     parser.add_argument(
@@ -125,6 +133,13 @@ def add(commands: Any) -> None:
     options.add_output(parser, "JSON", "where the poses go (default: a line for each object on the screen)")
     parser.add_argument("--overlay", type=Path, metavar="PNG", help="a picture of the result (with --frames: a folder)")
     parser.add_argument(
+        "--explain",
+        type=Path,
+        metavar="HTML",
+        help="without masks: a page of what was proposed, ranked and verified, and why it was taken or rejected (with "
+        "--frames: a folder)",
+    )
+    parser.add_argument(
         "--compare",
         type=Path,
         metavar="PNG",
@@ -144,7 +159,7 @@ def add(commands: Any) -> None:
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Estimate, print and draw; returns the exit status, 1 where no object is present in any frame."""
     frames = list_frames(arguments)
-    _check(arguments)
+    check(arguments)
     from ipjax.files.objects.loading import load
     from ipjax.files.weights.matching import load_matching_encoder
     from ipjax.inference.compilation_cache import use_compilation_cache
@@ -153,8 +168,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     many = arguments.frames is not None
     objects = [load(path) for path in arguments.objects]
     names = [info.name for _, info in objects]
-    first = _read_first(frames[0], arguments, names) if not many else None
-    _check_objects(objects, arguments)
+    first = read_first(frames[0], arguments, names) if not many else None
+    check_objects(objects, arguments)
     if many:
         choose_masks(frames, names, arguments)
     identities = [info.encoder for _, info in objects]
@@ -202,65 +217,6 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     messages.finish(text)
     found = [one["present"] for entry in entries for one in entry.get("objects", ())]
     return 0 if any(found) else 1
-
-
-def _check(arguments: argparse.Namespace) -> None:
-    """Refuse what cannot be done before the work; ``--size`` becomes ``--diameter``."""
-    for name in ("mask_label", "instance", "obj_id"):
-        if len(getattr(arguments, name) or ()) not in (0, len(arguments.objects)):
-            raise ValueError(f"--{name.replace('_', '-')} is given once for each object, in their order")
-    if arguments.output is not None:
-        options.check_output(arguments.output, (".json",))
-    several = arguments.frames is not None or len(arguments.objects) > 1 or arguments.instances != 1
-    if arguments.instances != 1 and (arguments.mask or arguments.box):
-        raise ValueError("--instances is for objects that are sought; a mask or a box shows one")
-    if arguments.mask_is_rough and not (arguments.mask or arguments.frames):
-        raise ValueError("--mask-is-rough needs a --mask")
-    for name, path, suffixes, is_folder in (
-        ("overlay", arguments.overlay, options.PICTURES, arguments.frames is not None),
-        ("comparison", arguments.compare, options.PICTURES, arguments.frames is not None),
-        ("mesh output", arguments.mesh_out, MESHES, several),
-    ):
-        if path is not None and not is_folder:
-            options.check_output(path, suffixes)
-        elif path is not None and path.exists() and not path.is_dir():
-            of = "--frames" if arguments.frames is not None else "several objects or instances"
-            raise ValueError(f"{path}: with {of}, the {name} is a folder")
-    if arguments.size is not None:
-        if not 1 <= arguments.size < 1e5:
-            raise ValueError(f"--size is in millimetres; {arguments.size:g} cannot be right")
-        arguments.diameter = 1e-3 * arguments.size
-    if arguments.diameter is not None and not 1e-4 < arguments.diameter < 100:
-        raise ValueError(f"--diameter is in metres; {arguments.diameter:g} cannot be right")
-    options.check_seed(arguments.seed)
-
-
-def _check_objects(objects: list[tuple[Any, Any]], arguments: argparse.Namespace) -> None:
-    """Refuse what these object files cannot give, before weights are loaded and anything is compiled."""
-    for path, (templates, info) in zip(arguments.objects, objects, strict=True):
-        if arguments.compare is not None and templates.reference is None:
-            raise ValueError(f"--compare: {path} keeps no photo that it was made from, so nothing to compare with")
-        if arguments.mesh_out is not None and (info.vertices is None or info.faces is None):
-            raise ValueError(f"--mesh-out: {path} keeps no mesh")
-
-
-def _read_first(files: FrameFiles, arguments: argparse.Namespace, names: list[str]) -> Images:
-    """Read a single frame, so that bad images are refused before weights are loaded and anything is compiled."""
-    from ipjax.inference.frames import frame
-
-    images = read_frame(files, arguments, names)
-    if is_without_masks(files):
-        from ipjax.detection.crops import read_scene
-
-        read_scene(images.rgb, images.depth, images.camera, arguments.depth_scale)
-        return images
-    for candidates, box in zip(images.candidates, files.boxes, strict=True):
-        given: dict[str, Any] = {"depth_scale": arguments.depth_scale, "crop": arguments.crop}
-        if candidates is None:
-            frame(images.rgb, images.depth, None, images.camera, box=box, **given)
-        else:
-            check_any(images, candidates, box, **given)
-    return images
 
 
 def _estimate_frame(

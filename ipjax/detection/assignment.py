@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ipjax.detection.records import Reason, Rival, Verdict
 from ipjax.metrics.surface import add_s
 from ipjax.records import Similarity, Templates
 
@@ -27,6 +28,12 @@ class Claim:
     confidence: float
     value: float  # what claims are sorted by
     source: Any = None  # what the caller knows it by
+    proposal: int = -1  # that led to it
+
+    @property
+    def rival(self) -> Rival:
+        """It, as what others lost to."""
+        return Rival(self.index, self.name, self.proposal, self.confidence)
 
 
 def shared_share(first: Bool[np.ndarray, "h w"], second: Bool[np.ndarray, "h w"]) -> float:
@@ -67,8 +74,8 @@ def assign(
     instances: int | Sequence[int],
     taken: float,
     apart: float,
-) -> tuple[list[Claim], list[tuple[Claim, str]]]:
-    """Those claims that hold, the surest first, and the others with the reason.
+) -> tuple[list[Claim], list[tuple[Claim, Verdict]]]:
+    """Those claims that hold, the surest first, and why each of the others does not.
 
     The claim of highest value holds first; then the next one whose place is not taken: by its own object (the same pose
     within ``apart`` diameters, or more than ``taken`` of the smaller mask), or by another. By what the poses are worth,
@@ -78,23 +85,30 @@ def assign(
       instances: of an object, at most; one number for all, or one for each.
     """
     kept: list[Claim] = []
-    dropped: list[tuple[Claim, str]] = []
+    dropped: list[tuple[Claim, Verdict]] = []
     for claim in sorted(claims, key=lambda one: -one.value):
         mine = [one for one in kept if one.index == claim.index]
-        again = next((one for one in mine if _is_same(claim, one, templates, taken, apart)), None)
+        again = next(((why, one) for one in mine if (why := _why_same(claim, one, templates, taken, apart))), None)
         other = next((one for one in kept if shared_share(one.mask, claim.mask) > taken), None)
+        most = instances if isinstance(instances, int) else instances[claim.index]
         if again is not None:
-            dropped.append((claim, "the same instance was found with more confidence"))
+            why, one = again
+            by = "its mask" if why is Reason.SAME_MASK else "its pose"
+            words = f"the same instance, by {by}, was found with more confidence ({one.confidence:.2f})"
+            dropped.append((claim, Verdict(why, words, one.rival)))
         elif other is not None:
-            dropped.append((claim, f"its pixels are taken by {other.name}, which is surer"))
-        elif len(mine) >= (most := instances if isinstance(instances, int) else instances[claim.index]):
-            dropped.append((claim, f"{most} surer instance{'s were' if most > 1 else ' was'} found"))
+            words = f"its pixels are taken by {other.name}, which is surer ({other.confidence:.2f})"
+            dropped.append((claim, Verdict(Reason.CLAIMED, words, other.rival)))
+        elif len(mine) >= most:
+            words = f"{most} surer instance{'s were' if most > 1 else ' was'} found ({mine[-1].confidence:.2f})"
+            dropped.append((claim, Verdict(Reason.ENOUGH, words, mine[-1].rival)))
         else:
             kept.append(claim)
     return kept, dropped
 
 
-def _is_same(claim: Claim, other: Claim, templates: Sequence[Templates], taken: float, apart: float) -> bool:
+def _why_same(claim: Claim, other: Claim, templates: Sequence[Templates], taken: float, apart: float) -> Reason | None:
     if shared_share(claim.mask, other.mask) > taken:
-        return True
-    return same_instance(templates[claim.index], claim.pose, other.pose, apart)
+        return Reason.SAME_MASK
+    same = same_instance(templates[claim.index], claim.pose, other.pose, apart)
+    return Reason.SAME_PLACE if same else None

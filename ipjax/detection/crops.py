@@ -1,6 +1,7 @@
 """The crops of a frame's proposals: each cut out once, described once, and shared by all objects."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from ipjax.inference.depth import check_frame_unit, find_depth_scale, to_metres
 from ipjax.inference.frames import cut_object
 from ipjax.inference.images import check_images
 from ipjax.records import Patches, Similarity, View
+
+_DISC = 3  # pixels about a click that are undistorted with it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,3 +85,29 @@ def undistort_mask(mask: np.ndarray, camera: Any) -> np.ndarray:
     _, _, plain, _ = undistort_frame(np.zeros((*mask.shape, 3), np.uint8), depth, mask, None, intrinsics)
     assert plain is not None  # a mask was given
     return plain
+
+
+def undistort_pixel(pixel: Sequence[int | float], camera: Any, size: tuple[int, int]) -> tuple[float, float]:
+    """Where a pixel (x, y) of a height × width image is in the image without lens distortion.
+
+    Raises:
+        ValueError: these are no two numbers, or no pixel of the image; in words.
+    """
+    height, width = size
+    place = np.asarray(pixel, np.float64)
+    shown = ", ".join(f"{value:g}" for value in place.reshape(-1))
+    if place.shape != (2,):
+        raise ValueError(f"a click is x, y in pixels, not {shown or 'nothing'}")
+    x, y = place.tolist()
+    if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
+        raise ValueError(f"the click ({shown}) lies outside the image of {width} × {height} pixels")
+    intrinsics = as_intrinsics(camera)
+    if not intrinsics.distortion:
+        return x, y
+    rows, columns = np.indices(size)
+    disc = (rows - y) ** 2 + (columns - x) ** 2 <= _DISC**2  # pixels are moved backwards: this one alone could be lost
+    try:
+        found = undistort_mask(disc, camera)
+    except ValueError:
+        raise ValueError(f"the click ({shown}) lies outside the undistorted image") from None
+    return float(np.nonzero(found)[1].mean()), float(np.nonzero(found)[0].mean())

@@ -10,12 +10,12 @@ import numpy as np
 
 from ipjax.config import Config, DetectConfig
 from ipjax.detection.assignment import Claim, assign
-from ipjax.detection.crops import Crop, Scene, cut_crop, read_scene
+from ipjax.detection.crops import Crop, Scene, cut_crop, read_scene, undistort_pixel
 from ipjax.detection.proposals.propose import ProposalConfig, Proposals, propose
-from ipjax.detection.records import Detections, Rejected
+from ipjax.detection.records import Detections, Ranking, Rejected
 from ipjax.detection.signatures import Signature, crop_signature, glance, similarity, template_signatures
 from ipjax.detection.stopwatch import Stopwatch
-from ipjax.detection.verification import Candidate, Verifier, as_detection, describe_crop, reject
+from ipjax.detection.verification import Candidate, Verifier, as_detection, describe_crop, is_at, reject
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.batching import compact, thin_templates
 from ipjax.inference.estimator import MULTIPLE, Estimator
@@ -34,6 +34,8 @@ class Sight:
     used: np.ndarray  # the numbers of those crops
     similarity: np.ndarray  # objects × proposals, filled in by `Detector.seek`
     watch: Stopwatch
+    rankings: dict[int, Ranking] = dataclasses.field(default_factory=dict)  # of objects, filled in likewise
+    clicks: dict[int, tuple[float, float]] = dataclasses.field(default_factory=dict)  # likewise
 
 
 class Detector:
@@ -91,6 +93,7 @@ class Detector:
         *,
         instances: int | None = 1,
         diameters: Sequence[float | None] | None = None,
+        clicks: Sequence[Sequence[int | float] | None] | None = None,
         depth_scale: float | None = None,
         seed: int = 0,
         progress: bool = False,
@@ -104,6 +107,8 @@ class Detector:
                 distortion.
             instances: of each object, at most; None = as many as are there (up to ``detection.instances``).
             diameters: each object's true diameter in metres, None where it is not known.
+            clicks: of each object a pixel (x, y) that shows it, in the image as it was given; None where it is not
+                known. Where all objects have one, only what has a click on it is proposed.
             seed: same seed, same answer.
             progress: show a bar.
 
@@ -112,7 +117,7 @@ class Detector:
             it is the caller's.
 
         Raises:
-            ValueError: the images do not fit together, or there is no depth; in words.
+            ValueError: the images do not fit together, there is no depth, or a click lies outside; in words.
         """
         most = self.detection.instances if instances is None else instances
         if most < 1:
@@ -123,19 +128,32 @@ class Detector:
             raise ValueError(f"{count} objects and {len(diameters)} diameters")
         if not all(one is None or 0 < one < np.inf for one in diameters):
             raise ValueError(f"diameters are positive metres, or None, not {diameters}")
+        clicks = [None] * count if clicks is None else list(clicks)
+        if len(clicks) != count:
+            raise ValueError(f"{count} objects and {len(clicks)} clicks")
+        pixels = [None if one is None else undistort_pixel(one, camera, np.shape(rgb)[:2]) for one in clicks]
         # Of one object, the frame is cut up by its size, too; the proposals of several are shared.
         size = diameters[0] if count == 1 else None
-        sight = self.look(rgb, depth, camera, depth_scale, diameter=size)
+        at = [one for one in pixels if one is not None]
+        sight = self.look(rgb, depth, camera, depth_scale, diameter=size, at=at if len(at) == count else ())
         claims: list[Claim] = []
         rejected: list[Rejected] = []
         for index in bar(range(count), desc="detecting", unit=" objects", disable=not progress or count < 2):
-            found, others = self.seek(sight, index, instances=most, diameter=diameters[index], seed=seed)
+            about = {"diameter": diameters[index], "click": pixels[index], "seed": seed}
+            found, others = self.seek(sight, index, instances=most, **about)
             claims += found
             rejected += others
         return self.choose(sight, claims, rejected, instances=most)
 
     def look(
-        self, rgb: Any, depth: Any, camera: Any, depth_scale: float | None = None, *, diameter: float | None = None
+        self,
+        rgb: Any,
+        depth: Any,
+        camera: Any,
+        depth_scale: float | None = None,
+        *,
+        diameter: float | None = None,
+        at: Sequence[tuple[float, float]] = (),
     ) -> Sight:
         """The first part of `detect`: proposals, cut out and described, of no object in particular.
 
@@ -143,6 +161,7 @@ class Detector:
             rgb, depth, camera, depth_scale: as `detect` has them.
             diameter: metres, of all that is sought, where it is known: pieces of that size are proposed, too, and none
                 that is much longer.
+            at: pixels (x, y) of the image without lens distortion, one of which every proposal has; none = anywhere.
 
         Raises:
             ValueError: as `detect`.
@@ -153,6 +172,8 @@ class Detector:
             settings = ProposalConfig() if self.proposals is None else self.proposals
             if diameter is not None:
                 settings = dataclasses.replace(settings, diameters=(diameter,))
+            if at:
+                settings = dataclasses.replace(settings, at=tuple(at))
             proposals = propose(scene.rgb, scene.depth, scene.matrix, settings)
         with watch("cut"):
             crops = [cut_crop(scene, mask, **self.options) for mask in proposals.masks]
@@ -165,7 +186,14 @@ class Detector:
         return Sight(scene, proposals, crops, signatures, used, ranks, watch)
 
     def seek(
-        self, sight: Sight, index: int, *, instances: int = 1, diameter: float | None = None, seed: int = 0
+        self,
+        sight: Sight,
+        index: int,
+        *,
+        instances: int = 1,
+        diameter: float | None = None,
+        click: tuple[float, float] | None = None,
+        seed: int = 0,
     ) -> tuple[list[Claim], list[Rejected]]:
         """The second part of `detect`: one object in the proposals that are most like it.
 
@@ -173,18 +201,21 @@ class Detector:
             sight: from `look`.
             index: of the object.
             instances, diameter, seed: as `detect` has them.
+            click: a pixel (x, y) of the object, in the image without lens distortion.
 
         Returns:
             Poses with the pixels that they claim, and what was given up.
         """
-        order = self._rank(sight, index, self.detection.verified + 2 * (instances - 1))
+        if click is not None:
+            sight.clicks[index] = click
+        order = self._rank(sight, index, self.detection.verified + 2 * (instances - 1), click)
         candidates = [
             Candidate(index, i, float(sight.similarity[index, i]), sight.proposals.masks[i], crop)
             for i in order
             if (crop := sight.crops[i]) is not None
         ]
         about = self.estimator, self.detection, self.options, sight.scene, sight.watch
-        verifier = Verifier(*about, diameter=diameter, seed=seed)
+        verifier = Verifier(*about, diameter=diameter, click=click, seed=seed)
         return verifier.verify(candidates, instances), verifier.rejected
 
     def choose(
@@ -207,7 +238,10 @@ class Detector:
         lost = [reject(claim.source, reason, claim.mask) for claim, reason in dropped]
         seconds = dict(sight.watch.spent)
         found = tuple(as_detection(claim) for claim in kept)
-        return Detections(found, (*rejected, *lost), sight.proposals, sight.similarity, sight.scene, seconds)
+        rankings = tuple(sight.rankings[index] for index in sorted(sight.rankings))
+        clicks = tuple(sight.clicks.values())
+        about = sight.proposals, sight.similarity, sight.scene, seconds, tuple(self.names), rankings, clicks
+        return Detections(found, (*rejected, *lost), *about)
 
     def _glance_all(self, crops: Sequence[Crop], watch: Stopwatch) -> Signature:
         encoder = self.estimator.encoder
@@ -220,7 +254,7 @@ class Detector:
         found += [found[0]] * (-len(found) % _BUCKET)
         return jax.block_until_ready(jax.tree.map(lambda *x: jnp.stack(x), *found))
 
-    def _rank(self, sight: Sight, index: int, count: int) -> list[int]:
+    def _rank(self, sight: Sight, index: int, count: int, click: tuple[float, float] | None) -> list[int]:
         """The ``count`` proposals most like an object, the best first: chosen at a glance, ranked by whole crops."""
         if sight.signatures is None:
             return []
@@ -234,13 +268,21 @@ class Detector:
                 return np.asarray(found)
 
         mine[sight.used] = rate(sight.signatures)[: len(sight.used)]
+        masks = sight.proposals.masks
+        fits = [i for i in range(len(mine)) if np.isfinite(mine[i]) and (click is None or is_at(masks[i], click))]
+        order = np.array(fits, int)[np.argsort(-mine[fits], kind="stable")]
         most = max(settings.shortlist, count)
-        best = [int(i) for i in np.argsort(-mine, kind="stable")[:most] if np.isfinite(mine[i])]
-        found = [self._signature(sight, proposal) for proposal in best]
-        found += [found[0]] * (most - len(found))
-        again = rate(jax.tree.map(lambda *x: jnp.stack(x), *found))[: len(best)]
-        mine[best] = again
-        return [best[i] for i in np.argsort(-again, kind="stable")][:count]
+        best = [int(i) for i in order[:most]]
+        if best:
+            found = [self._signature(sight, proposal) for proposal in best]
+            found += [found[0]] * (most - len(found))
+            again = rate(jax.tree.map(lambda *x: jnp.stack(x), *found))[: len(best)]
+            mine[best] = again
+            best = [best[i] for i in np.argsort(-again, kind="stable")]
+            order[: len(best)] = best
+        estimated = min(count, len(best))
+        sight.rankings[index] = Ranking(index, self.names[index], order, mine[order], len(best), estimated)
+        return best[:count]
 
     def _signature(self, sight: Sight, proposal: int) -> Signature:
         """Of a whole crop, which is described when it is first wanted."""

@@ -13,13 +13,16 @@ from ipjax.config import DetectConfig
 from ipjax.detection.assignment import Claim, overlap, same_instance
 from ipjax.detection.crops import Crop, Scene, cut_crop
 from ipjax.detection.masks import mask_from_pose
-from ipjax.detection.records import Detection, Rejected
+from ipjax.detection.records import Detection, Reason, Rejected, Rival, Step, Verdict
 from ipjax.detection.stopwatch import Stopwatch
 from ipjax.estimation.features import describe
 from ipjax.inference.estimator import Estimator, Result
 from ipjax.records import Patches, PoseEstimate
 
-ELSEWHERE = "the depth where its pose is belongs to something else"
+ELSEWHERE = Verdict(Reason.OTHER_DEPTH, "the depth where its pose is belongs to something else")
+OFF_CLICK = Verdict(Reason.OFF_CLICK, "its pose is not at the click")
+PROPOSAL, REST, POSED = "a proposal", "what another instance left of a proposal", "the mask of its pose"
+NEAR = 5  # pixels beside a mask at which a click is still on it
 BESIDE = 3  # pixels beside a pose's outline that are not left to another instance
 LEAST_REST = 150  # pixels of a proposal that its pose must leave for another instance to be sought there
 REST_SHARE = 0.25  # and that share of the pose's own outline
@@ -43,6 +46,18 @@ class Trial:
     candidate: Candidate
     result: Result
     value: float  # confidence × score, and how well a known size agrees
+    where: str = PROPOSAL  # what was cut out, in words
+    earlier: tuple[Step, ...] = ()  # that led to it
+
+    @property
+    def rival(self) -> Rival:
+        """It, as what others lost to."""
+        about = self.candidate.index, self.result.info.name, self.candidate.proposal
+        return Rival(*about, float(self.result.estimate.confidence))
+
+    def as_step(self, posed: Bool[np.ndarray, "h w"] | None = None) -> Step:
+        """It, and the mask of its pose."""
+        return Step.of(self.where, self.candidate.crop.mask, self.result, self.value, posed)
 
 
 @dataclasses.dataclass
@@ -55,6 +70,7 @@ class Verifier:
     scene: Scene
     watch: Stopwatch
     diameter: float | None = None
+    click: tuple[float, float] | None = None  # a pixel of what is sought
     seed: int = 0
     rejected: list[Rejected] = dataclasses.field(default_factory=list)
 
@@ -65,23 +81,23 @@ class Verifier:
         often one proposal.
         """
         trials = [self._try(one, "verify") for one in candidates]
-        chosen: list[PoseEstimate] = []
+        chosen: list[Trial] = []
         mended = self._mend(trials, chosen, self.settings.mended + instances - 1)
         found = list(mended)
         while mended and instances > 1 and len(found) < self.settings.mended + 2 * instances:
             rests = [rest for trial in mended if (rest := self._rest(trial)) is not None]
-            mended = self._mend([self._try(one, "verify rest") for one in rests], chosen, len(chosen) + instances)
+            mended = self._mend([self._try(one, "verify rest", REST) for one in rests], chosen, len(chosen) + instances)
             found += mended
         return self._claims(found)
 
-    def _try(self, candidate: Candidate, stage: str) -> Trial:
+    def _try(self, candidate: Candidate, stage: str, where: str = PROPOSAL, earlier: tuple[Step, ...] = ()) -> Trial:
         crop = candidate.crop
         patches = describe_crop(self.estimator, crop, self.watch)
         about = crop.view, crop.camera_from_crop
         with self.watch(stage):
             result = self.estimator.run(candidate.index, *about, seed=self.seed, patches=patches)
         self.watch.move("compile", result.seconds.get("compile", 0.0), stage)
-        return Trial(candidate, result, self._value(result.estimate))
+        return Trial(candidate, result, self._value(result.estimate), where, earlier)
 
     def _value(self, found: PoseEstimate) -> float:
         """What trials are compared by: confidence × score, and how well a known size agrees."""
@@ -93,7 +109,7 @@ class Verifier:
         off = np.log(float(found.diameter) / self.diameter) / self.settings.size_deviation
         return value * float(np.exp(-0.5 * off**2))
 
-    def _mend(self, trials: Sequence[Trial], chosen: list[PoseEstimate], most: int) -> list[Trial]:
+    def _mend(self, trials: Sequence[Trial], chosen: list[Trial], most: int) -> list[Trial]:
         """The best poses that differ, estimated again in the masks that they give; ``chosen`` has them, too."""
         mended: list[Trial] = []
         for trial in sorted(trials, key=lambda one: -one.value):
@@ -101,21 +117,30 @@ class Verifier:
             templates, pose = trial.result.templates, found.camera_from_object
             apart = self.settings.same
             if trial.value <= 0:
-                self._reject(trial, "no pose was found")
+                self._reject(trial, Verdict(Reason.NO_POSE, "no pose was found"))
+                continue
+            placed = lambda one: one.result.estimate.camera_from_object
+            again = (one for one in chosen if same_instance(templates, placed(one), pose, apart))
+            if (other := next(again, None)) is not None:
+                words = "another proposal led to the same pose, and is surer"
+                self._reject(trial, Verdict(Reason.SAME_POSE, words, other.rival))
             elif len(chosen) >= most:
-                self._reject(trial, "other proposals have surer poses")
-            elif any(same_instance(templates, one.camera_from_object, pose, apart) for one in chosen):
-                self._reject(trial, "another proposal led to the same pose, and is surer")
+                words = "other proposals have surer poses"
+                self._reject(trial, Verdict(Reason.WEAKER, words, chosen[-1].rival))
             else:
-                chosen.append(found)
                 with self.watch("mask"):
-                    mask = mask_from_pose(templates, pose, self.scene.matrix, self.scene.depth, self.settings)[0]
+                    mask, whole = mask_from_pose(templates, pose, self.scene.matrix, self.scene.depth, self.settings)
                     crop = cut_crop(self.scene, mask, **self.options)
+                if self.click is not None and not is_at(whole, self.click):
+                    self._reject(trial, OFF_CLICK, mask)
+                    continue
+                chosen.append(trial)
                 if crop is None:
-                    self._reject(trial, ELSEWHERE)
+                    self._reject(trial, ELSEWHERE, mask)
                 else:
                     again = dataclasses.replace(trial.candidate, crop=crop)
-                    mended.append(self._try(again, "verify again"))
+                    earlier = *trial.earlier, trial.as_step(mask)
+                    mended.append(self._try(again, "verify again", POSED, earlier))
         return mended
 
     def _rest(self, trial: Trial) -> Candidate | None:
@@ -145,7 +170,7 @@ class Verifier:
         for trial in trials:
             found, info = trial.result.estimate, trial.result.info
             if trial.value <= 0:
-                self._reject(trial, "no pose was found in the mask of its first pose")
+                self._reject(trial, Verdict(Reason.NO_POSE, "no pose was found in the mask of its first pose"))
                 continue
             about = trial.result.templates, found.camera_from_object, self.scene.matrix, self.scene.depth
             with self.watch("mask"):
@@ -153,12 +178,21 @@ class Verifier:
             if not mask.any():
                 self._reject(trial, ELSEWHERE)
                 continue
+            if self.click is not None and not is_at(mask, self.click):
+                self._reject(trial, OFF_CLICK, mask)
+                continue
             known = found.camera_from_object, float(found.confidence), trial.value, trial
-            claims.append(Claim(trial.candidate.index, info.name, mask, *known))
+            claims.append(Claim(trial.candidate.index, info.name, mask, *known, trial.candidate.proposal))
         return claims
 
-    def _reject(self, trial: Trial, reason: str) -> None:
-        self.rejected.append(reject(trial, reason))
+    def _reject(self, trial: Trial, verdict: Verdict, mask: Bool[np.ndarray, "h w"] | None = None) -> None:
+        self.rejected.append(reject(trial, verdict, mask))
+
+
+def is_at(mask: Bool[np.ndarray, "h w"], pixel: tuple[float, float], near: int = NEAR) -> bool:
+    """Whether a mask has a pixel within ``near`` pixels of this one (x, y)."""
+    x, y = (round(value) for value in pixel)
+    return bool(mask[max(y - near, 0) : max(y + near + 1, 0), max(x - near, 0) : max(x + near + 1, 0)].any())
 
 
 def describe_crop(estimator: Estimator, crop: Crop, watch: Stopwatch) -> Patches:
@@ -179,19 +213,23 @@ def as_detection(claim: Claim) -> Detection:
     left, top = int(columns[0]), int(rows[0])
     box = left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
     about = trial.candidate.proposal, trial.candidate.similarity, overlap(trial.candidate.mask, claim.mask)
-    return Detection(claim.index, claim.name, claim.mask, box, claim.value, trial.result, *about)
+    steps = *trial.earlier, trial.as_step(claim.mask)
+    return Detection(claim.index, claim.name, claim.mask, box, claim.value, trial.result, *about, steps)
 
 
-def reject(trial: Trial, reason: str, mask: Bool[np.ndarray, "h w"] | None = None) -> Rejected:
-    """A trial that was given up, for this reason."""
+def reject(trial: Trial, verdict: Verdict, mask: Bool[np.ndarray, "h w"] | None = None) -> Rejected:
+    """A trial that was given up, for this reason; ``mask``: of its pose, where it is known."""
     candidate = trial.candidate
     return Rejected(
         candidate.index,
         trial.result.info.name,
         candidate.proposal,
         candidate.similarity,
-        reason,
+        verdict.words,
+        verdict.why,
+        verdict.rival,
         float(trial.result.estimate.confidence),
         trial.value,
         candidate.crop.mask if mask is None else mask,
+        (*trial.earlier, trial.as_step(mask)),
     )

@@ -9,14 +9,15 @@ from jaxtyping import UInt8
 
 
 def render_page(template: Path, **values: Any) -> str:
-    """The text of a template (``*.html.jinja``), which may include what lies beside it.
+    """The text of a template (``*.html.jinja``), which may include what lies beside it, and ``pages.css``, which all
+    pages share.
 
     Values are escaped. A value that the template names and that is not given is an error (`jinja2.UndefinedError`).
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     environment = Environment(
-        loader=FileSystemLoader(template.parent),
+        loader=FileSystemLoader([template.parent, Path(__file__).parent]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -105,14 +105,13 @@ def draw(
         [pose for pose, s in zip(poses, shown, strict=True) if s],
         [info for info, s in zip(objects, shown, strict=True) if s],
         extents=None if extents is None else [e for e, s in zip(extents, shown, strict=True) if s],
-        boxes=[_own_box(e, info) for e, info, s in zip(estimates, objects, shown, strict=True) if s],
+        boxes=[own_box(e, info) for e, info, s in zip(estimates, objects, shown, strict=True) if s],
         colours=[PALETTE[i % len(PALETTE)] for i, s in enumerate(shown) if s],
         height=height,
     )
     for i, mask in enumerate(masks or ()):
         if mask is not None and mask.any():
-            label = f"{objects[i].name} {float(estimates[i].confidence):.2f}"
-            _draw_mask(photo, mask, label, PALETTE[i % len(PALETTE)])
+            draw_mask(photo, mask, name_estimate(objects[i].name, estimates[i]), PALETTE[i % len(PALETTE)])
     cards = [
         draw_card(estimate, info, one, PALETTE[i % len(PALETTE)], compact=len(objects) > 1)
         for i, (estimate, info, one) in enumerate(zip(estimates, objects, evidence, strict=True))
@@ -120,7 +119,7 @@ def draw(
     return attach_cards(photo, cards)
 
 
-def _own_box(estimate: PoseEstimate, info: ObjectInfo) -> np.ndarray | None:
+def own_box(estimate: PoseEstimate, info: ObjectInfo) -> np.ndarray | None:
     """The box that was estimated, of an object from a photo without depth; any other's is that of its mesh."""
     guessed = info.reference is not None and not info.reference.metric and info.reference.method != "elsewhere"
     return np.asarray(estimate.box) if guessed else None
@@ -168,6 +167,30 @@ def draw_overlay(
     return image
 
 
+def name_estimate(name: str, estimate: PoseEstimate) -> str:
+    """The label of an object in a picture: its name, its confidence, and whether it is only a guess."""
+    return f"{name} {float(estimate.confidence):.2f}" + ("" if bool(estimate.present) else ", a guess")
+
+
+def draw_mask(
+    image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h2 w2"], label: str, colour: tuple[int, int, int]
+) -> None:
+    """Draw into an image a dotted outline of a mask, which may be of another size, and a label above it."""
+    height, width = image.shape[:2]
+    enlarged = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    contours, _ = cv2.findContours(enlarged, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    stroke = max(round(height / 450), 1)
+    for contour in contours:
+        for x, y in contour[:: 5 * stroke, 0]:
+            cv2.circle(image, (int(x), int(y)), stroke, colour, -1, cv2.LINE_AA)
+    x, y, _, _ = cv2.boundingRect(enlarged)
+    canvas = Image.fromarray(image)
+    pen = ImageDraw.Draw(canvas)
+    place = (x, max(y - 4 * stroke, 12 * stroke))
+    pen.text(place, label, colour, find_font(10 * stroke), "lb", stroke_width=2, stroke_fill=(10, 10, 10))
+    image[:] = np.asarray(canvas)
+
+
 def silhouette(
     vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, matrix: Float[np.ndarray, "3 3"], height: int, width: int
 ) -> Bool[np.ndarray, "h w"]:
@@ -196,23 +219,6 @@ def write_image(path: str | Path, image: np.ndarray) -> None:
         raise ValueError(f"{path}: pictures are written as .png or .jpg")
     with writing(path) as temporary:
         Image.fromarray(image).save(temporary, kind, **({"quality": 92} if kind == "JPEG" else {}))
-
-
-def _draw_mask(image: np.ndarray, mask: np.ndarray, label: str, colour) -> None:
-    """A dotted outline of a mask, which may be of another size, and a label above it."""
-    height, width = image.shape[:2]
-    enlarged = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    contours, _ = cv2.findContours(enlarged, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    stroke = max(round(height / 450), 1)
-    for contour in contours:
-        for x, y in contour[:: 5 * stroke, 0]:
-            cv2.circle(image, (int(x), int(y)), stroke, colour, -1, cv2.LINE_AA)
-    x, y, _, _ = cv2.boundingRect(enlarged)
-    canvas = Image.fromarray(image)
-    pen = ImageDraw.Draw(canvas)
-    place = (x, max(y - 4 * stroke, 12 * stroke))
-    pen.text(place, label, colour, find_font(10 * stroke), "lb", stroke_width=2, stroke_fill=(10, 10, 10))
-    image[:] = np.asarray(canvas)
 
 
 def _line(image: np.ndarray, a: np.ndarray, b: np.ndarray, colour, width: int, reach: float = 1e5) -> None:

@@ -1,7 +1,10 @@
 """``ipjax estimate`` without a mask: the object is sought, told and drawn; and a rough mask is mended."""
 
+import base64
 import dataclasses
+import html
 import json
+import re
 
 import cv2
 import equinox as eqx
@@ -66,6 +69,59 @@ def test_objects_are_sought_where_no_mask_is_given(scene, capfd):
     assert np.asarray(Image.open(folder / "out.png")).std() > 20
 
 
+def test_a_page_explains_what_was_found_and_what_was_not(scene, capfd):
+    folder, words, _ = scene
+    page = folder / "why.html"
+    assert run([*words, "--explain", str(page), "--json"]) == 0
+    told = json.loads(capfd.readouterr().out)["frames"][0]
+    assert told["detection"]["page"] == str(page)
+    text = page.read_text()
+    assert "http" not in text.replace("http-equiv", "")  # nothing of it lies elsewhere
+    (ranking,) = told["detection"]["ranking"]
+    (one,) = told["objects"]
+    for section in ("Found", "Proposals", "Ranking", "Verification", "Time"):
+        assert re.search(rf"<h[23]>{section}", text)
+    assert f"{one['detected']['confidence']:.2f}" in text and ">found<" in text
+    for lost in told["detection"]["rejected"]:
+        assert html.escape(lost["reason"]) in text and f">{lost['why']}<" in text and lost["steps"]
+        assert lost["lost_to"] is None or lost["lost_to"]["proposal"] in ranking["proposals"]
+    pictures = [read_picture(code) for code in re.findall(r"data:image/jpeg;base64,([^\"]+)", text)]
+    assert len(pictures) > 2 + ranking["estimated"]
+    # The frame with the object drawn into it, and with the proposals; then crops, all of one size.
+    assert pictures[0].shape[0] == pictures[1].shape[0] == 900
+    assert {picture.shape for picture in pictures[2:]} == {(160, 160, 3)}
+    # Estimated with the settings that were asked for, in the mask that was found.
+    assert one["detected"]["steps"][-1]["where"].endswith("settings asked for")
+
+
+def read_picture(code: str) -> np.ndarray:
+    return cv2.imdecode(np.frombuffer(base64.b64decode(code), np.uint8), cv2.IMREAD_COLOR)
+
+
+def test_a_folder_of_frames_is_explained_page_by_page(scene):
+    folder, (_, mug, *_), frame = scene
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir()
+    depth = np.zeros_like(frame.depth)
+    depth[:2, :2] = 1.0  # no proposal has depth: that is explained, too
+    for name in ("a", "b"):
+        Image.fromarray(frame.rgb).save(folder / "rgb" / f"{name}.png")
+        np.save(folder / "depth" / f"{name}.npy", depth)
+    assert run(["estimate", mug, "--frames", str(folder), "--explain", str(folder / "why"), "--quiet"]) == 1
+    assert sorted(path.name for path in (folder / "why").iterdir()) == ["a.html", "b.html"]
+    assert "no proposal to compare it with" in (folder / "why" / "b.html").read_text()
+
+
+def test_a_click_says_which(scene, capfd):
+    folder, words, frame = scene
+    for mask in frame.masks:
+        y, x = (int(np.median(side)) for side in np.nonzero(mask))
+        assert run([*words, "--click", f"{x},{y}", "--json"]) == 0
+        (one,) = json.loads(capfd.readouterr().out)["frames"][0]["objects"]
+        assert overlap(decode_rle(one["detected"]["mask"]), mask) > 0.8
+    assert folder.is_dir()
+
+
 def test_a_rough_mask_is_mended_and_it_is_said(scene, capfd):
     folder, words, frame = scene
     wide = cv2.dilate(frame.masks[0].astype(np.uint8), np.ones((17, 17), np.uint8))
@@ -86,6 +142,13 @@ def test_a_rough_mask_is_mended_and_it_is_said(scene, capfd):
         (("--instances", "0"), "a number from 1 on, or 'all'"),
         (("--mask-is-rough",), "needs a --mask"),
         (("--mask", "rgb.png", "--instances", "2"), "for objects that are sought"),
+        (("--mask", "rgb.png", "--explain", "a.html"), "shows how objects are sought"),
+        (("--explain", "a.pdf"), "must end in .html"),
+        (("--click", "10,10", "--box", "1,1,9,9"), "give one of them"),
+        (("--click", "10,10", "--click", "20,20"), "once for each object, in their order; got 2"),
+        (("--click", "10"), "is no pixel"),
+        (("--click", "320,10"), "the click (320, 10) lies outside the image"),
+        (("--click", "10,10", "--instances", "2"), "a click shows one"),
         (("--depth-scale", "-1"), "positive"),
         (("--depth-scale", "1000"), "pass depth_scale=1"),
         (("--obj-id", "5"), "--obj-id says which of several masks: it needs a --mask"),
@@ -102,6 +165,8 @@ def test_what_cannot_be_is_refused(scene, capfd, more, words):
     [
         (False, ("--mask-is-rough",), "no masks in mask/"),
         (True, ("--instances", "all"), "is for objects that are sought, but"),
+        (True, ("--explain", "pages"), "shows how objects are sought, but"),
+        (False, ("--click", "1,1"), "--click belongs to a single frame"),
     ],
 )
 def test_options_that_a_folder_of_frames_cannot_follow_are_refused(scene, capfd, masks, more, words):

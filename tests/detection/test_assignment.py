@@ -9,6 +9,7 @@ import numpy as np
 from builders.detections import ellipsoid, place
 
 from ipjax.detection.assignment import Claim, assign, overlap, same_instance, sample_surface, shared_share
+from ipjax.detection.records import Reason
 from ipjax.inference.batching import pad_alike
 from ipjax.records import Similarity
 
@@ -34,9 +35,12 @@ def test_the_surest_claim_of_a_place_holds():
     ]
     kept, dropped = assign(claims, templates, instances=1, taken=0.5, apart=0.1)
     assert [(one.index, one.confidence) for one in kept] == [(1, 0.9), (0, 0.5)]
-    reasons = {one.confidence: reason for one, reason in dropped}
-    assert "taken by object 1" in reasons[0.6]
-    assert "same instance" in reasons[0.4] and "1 surer instance was" in reasons[0.3]
+    told = {one.confidence: verdict for one, verdict in dropped}
+    assert told[0.6].why is Reason.CLAIMED and "taken by object 1" in told[0.6].words
+    assert told[0.4].why is Reason.SAME_MASK and "same instance" in told[0.4].words
+    assert told[0.3].why is Reason.ENOUGH and "1 surer instance was" in told[0.3].words
+    rivals = {one: verdict.rival for one, verdict in told.items()}
+    assert [(one.index, one.confidence) for one in rivals.values() if one] == [(1, 0.9), (0, 0.5), (1, 0.9)]
     kept, _ = assign(claims, templates, instances=3, taken=0.5, apart=0.1)
     assert len(kept) == 3
     # The order in which they come does not matter.
@@ -53,6 +57,14 @@ def test_turns_after_which_a_shape_looks_the_same_are_one_instance():
     moved = Similarity(pose.rotation, pose.translation + jnp.array([0.9 * 0.2, 0.0, 0.0]), pose.scale)
     assert not same_instance(templates, pose, moved, 0.1)
     assert jax.tree.all(jax.tree.map(np.array_equal, pose, place(0.0, 0.0)))
+
+
+def test_one_place_under_two_masks_is_one_instance():
+    """Where the masks do not overlap, the poses tell."""
+    claims = [claim(0, square(0, 10), 0.9, 0.0), claim(0, square(30, 40), 0.8, 0.001)]
+    kept, dropped = assign(claims, [ellipsoid()[0]], instances=2, taken=0.5, apart=0.1)
+    assert [one.confidence for one in kept] == [0.9]
+    assert [verdict.why for _, verdict in dropped] == [Reason.SAME_PLACE]
 
 
 def test_padding_is_no_surface():

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 from builders.detections import HEIGHT, MATRIX, WIDTH, detector, ellipsoid, make_frame, place
@@ -9,6 +10,10 @@ from builders.tiny_pipeline import assert_near
 
 from ipjax.cameras import unproject
 from ipjax.detection.assignment import overlap
+from ipjax.detection.crops import undistort_pixel
+from ipjax.detection.records import Reason
+from ipjax.detection.verification import is_at
+from ipjax.files.cameras.intrinsics import Intrinsics
 
 
 def test_an_object_is_found_with_its_pose_and_mask():
@@ -26,7 +31,7 @@ def test_an_object_is_found_with_its_pose_and_mask():
     assert first.score <= first.confidence and found.seconds["verify"] > 0
     assert found.similarity.shape == (2, len(found.proposals.masks))
     # Everything that was tried is told, with a reason, and only one object can have the pixels.
-    assert all(one.reason for one in found.rejected)
+    assert all(one.reason and one.why in Reason and one.steps for one in found.rejected)
     assert not any(overlap(one.mask, first.mask) > 0.5 for one in found[1:])
 
 
@@ -38,6 +43,65 @@ def test_two_instances_that_touch_are_two_and_none_is_found_twice():
     assert len([one for one in found if one.present]) == 2
     for mask in frame.masks:
         assert sum(overlap(one.mask, mask) > 0.6 for one in found) == 1
+
+
+def test_every_step_is_told():
+    """Which proposals were ranked how, which estimates led to a detection, and what each rejected one lost to."""
+    frame = make_frame(place(-0.12, 0.05))
+    found = detector().detect(frame.rgb, frame.depth, MATRIX)
+    first, ranking = found[0], found.rankings[0]
+    assert found.names == ("ellipsoid", "stranger") and [one.index for one in found.rankings] == [0, 1]
+    assert sorted(ranking.proposals) == list(np.flatnonzero(np.isfinite(found.similarity[0])))
+    assert (np.diff(ranking.similarity[: ranking.whole]) <= 0).all() and ranking.estimated <= 3
+    assert first.proposal in ranking.proposals[: ranking.estimated]
+    before, after = first.steps
+    assert np.array_equal(before.mask, found.proposals.masks[first.proposal])
+    assert np.array_equal(after.posed, first.mask) and (after.score, after.confidence) == (
+        first.score,
+        first.confidence,
+    )
+    lost = [one for one in found.rejected if one.rival is not None]
+    # Each proposal that was estimated has one fate.
+    tried = [one.proposal for one in (*found.found, *found.rejected) if one.index == 0]
+    assert sorted(tried) == sorted(ranking.proposals[: ranking.estimated])
+    assert lost and all(one.rival.proposal in found.rankings[one.rival.index].proposals for one in lost)
+    kept, rejected = found.told()
+    assert {one.index for one in kept} == {one.index for one in found}
+    assert len(kept) + len(rejected) == len(found) + len(found.rejected)
+
+
+def test_a_click_tells_which_of_two():
+    frame = make_frame(place(-0.15, 0.0, seed=1), place(0.15, 0.02, seed=2))
+    for mask in frame.masks:
+        y, x = (float(np.median(side)) for side in np.nonzero(mask))
+        found = detector().detect(frame.rgb, frame.depth, MATRIX, clicks=[(x, y), (x, y)])
+        (first, *_) = (one for one in found if one.name == "ellipsoid")
+        assert overlap(first.mask, mask) > 0.85 and found.clicks == ((x, y), (x, y))
+        assert all(is_at(one, (x, y), 2) for one in found.proposals.masks)
+    nothing = detector().detect(frame.rgb, frame.depth, MATRIX, clicks=[(2, 2), None])
+    assert not any(one.name == "ellipsoid" for one in nothing)
+    assert Reason.OFF_CLICK in {one.why for one in nothing.rejected} or not len(nothing.rankings[0].proposals)
+
+
+def test_a_click_moves_with_the_lens():
+    frame, matrix = make_frame(place(-0.12, 0.05)), MATRIX
+    lens = Intrinsics(matrix, (0.2, 0.0, 0.0, 0.0))
+    x, y = undistort_pixel((40, 60), lens, (HEIGHT, WIDTH))
+    back = lens_maps(lens)[:, round(y), round(x)]
+    assert np.allclose(back, (40, 60), atol=1.5)
+    assert undistort_pixel((40, 60), matrix, frame.depth.shape) == (40, 60)
+    with pytest.raises(ValueError, match=r"the click \(320, 5\) lies outside the image of 320 × 240"):
+        undistort_pixel((320, 5), matrix, (HEIGHT, WIDTH))
+    with pytest.raises(ValueError, match="a click is x, y"):
+        undistort_pixel((1, 2, 3), matrix, (HEIGHT, WIDTH))
+
+
+def lens_maps(lens):
+    """Where each pixel of the image without distortion is in the distorted one: x, then y."""
+    coefficients = np.asarray(lens.distortion)
+    return np.stack(
+        cv2.initUndistortRectifyMap(lens.matrix, coefficients, np.eye(3), lens.matrix, (WIDTH, HEIGHT), cv2.CV_32FC1)
+    )
 
 
 def test_a_known_size_is_evidence_and_same_seed_gives_same_answer():
@@ -93,6 +157,8 @@ def test_frames_that_cannot_be_searched_are_refused_in_words():
         sought.detect(frame.rgb, frame.depth, MATRIX, instances=0)
     with pytest.raises(ValueError, match="2 objects and 1 diameters"):
         sought.detect(frame.rgb, frame.depth, MATRIX, diameters=[0.1])
+    with pytest.raises(ValueError, match="2 objects and 1 clicks"):
+        sought.detect(frame.rgb, frame.depth, MATRIX, clicks=[(1, 1)])
     for size in (0.0, -0.1, np.nan):
         with pytest.raises(ValueError, match="positive metres"):
             sought.detect(frame.rgb, frame.depth, MATRIX, diameters=[size, None])

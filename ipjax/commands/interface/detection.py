@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import time
+from pathlib import Path
 from typing import Any
 
 from ipjax.commands.interface.frames import FrameFiles, Images
@@ -57,14 +58,13 @@ def detect_frame(
     arguments: argparse.Namespace,
     messages: Messages,
 ) -> tuple[list[Found], dict[str, Any]]:
-    """Find the objects, and estimate each in the mask that was found, with the settings that were asked for.
+    """Find the objects, and estimate each in the mask that was found, with the settings that were asked for; write the
+    page of ``--explain``.
 
     Returns:
         For each object, in their order, its instances, the surest first: the best guess, and of several those that are
-        present; and what was rejected, as JSON.
+        present; and how they were ranked and what was rejected, as JSON.
     """
-    from ipjax.detection.crops import cut_crop
-
     messages.print_notes()
     start = time.perf_counter()
     detections = detector.detect(
@@ -73,43 +73,110 @@ def detect_frame(
         images.camera,
         instances=arguments.instances,
         diameters=diameters,
+        clicks=arguments.click,
         depth_scale=arguments.depth_scale,
         seed=arguments.seed,
         progress=not arguments.quiet,
     )
     spent = time.perf_counter() - start
+    detections, seconds = _estimate_again(detections, estimator, diameters, arguments)
+    told, rejected = detections.told()
     found = []
-    for index, (_, info) in enumerate(estimator.objects):
-        mine = [one for one in detections if one.index == index]
-        kept = [one for number, one in enumerate(mine) if number == 0 or one.present]
-        estimated = []
-        for one in kept:
-            start = time.perf_counter()
-            crop = cut_crop(detections.scene, one.mask, resolution=info.resolution, crop=arguments.crop)
-            if crop is None:
-                continue
-            seconds = time.perf_counter() - start
-            given = {"seed": arguments.seed, "diameter": diameters[index]}
-            result = estimator.run(index, crop.view, crop.camera_from_crop, **given)
-            estimated.append(Found(index, result, one.mask, seconds, diameters[index], _about(one)))
-        found += estimated or [Found(index, None, None, 0.0, diameters[index], None)]
-    count, hits = len(detections.proposals.masks), sum(one.result is not None for one in found)
+    for index in range(len(estimator.objects)):
+        size = diameters[index]
+        mine = [one for one in told if one.index == index]
+        known = [Found(index, one.result, one.mask, seconds[id(one)], size, _about(one)) for one in mine]
+        found += known or [Found(index, None, None, 0.0, size, None)]
+    count, hits = len(detections.proposals.masks), len(told)
     many = {0: "no mask was", 1: "the mask was"}.get(hits, f"{hits} masks were")
     messages.note(f"{name}: {many} found, not given: {count} proposals, ranked and verified in {spent:.1f} s")
-    return found, {
+    entry = {
         "proposals": count,
-        "seconds": {stage: round(seconds, 6) for stage, seconds in detections.seconds.items()},
-        "rejected": [
+        "seconds": {stage: round(value, 6) for stage, value in detections.seconds.items()},
+        "ranking": [
             {
                 "object": one.name,
-                "proposal": one.proposal,
-                "similarity": one.similarity,
-                "confidence": one.confidence,
-                "score": one.score,
-                "reason": one.reason,
+                "proposals": one.proposals.tolist(),
+                "similarity": one.similarity.tolist(),
+                "compared_whole": one.whole,
+                "estimated": one.estimated,
             }
-            for one in detections.rejected
+            for one in detections.rankings
         ],
+        "rejected": [_rejected_as_json(one) for one in rejected],
+    }
+    if arguments.explain is not None:
+        entry["page"] = str(_explain(name, detections, arguments))
+    return found, entry
+
+
+def _estimate_again(
+    detections: Any, estimator: Any, diameters: list[float | None], arguments: argparse.Namespace
+) -> tuple[Any, dict[int, float]]:
+    """The detections that are told, estimated as was asked for, and the seconds that cutting each out took, by its id;
+    one that cannot be cut out is rejected."""
+    from ipjax.detection.crops import cut_crop
+    from ipjax.detection.records import Reason, Rejected, Step
+
+    told, rejected = detections.told()
+    found, lost, seconds = [], [], {}
+    for one in told:
+        start = time.perf_counter()
+        resolution = estimator.objects[one.index][1].resolution
+        crop = cut_crop(detections.scene, one.mask, resolution=resolution, crop=arguments.crop)
+        spent = time.perf_counter() - start
+        if crop is None:
+            about = one.index, one.name, one.proposal, one.similarity
+            words = "there is no depth to trust in the mask of its pose"
+            known = one.confidence, one.score, one.mask, one.steps
+            lost.append(Rejected(*about, words, Reason.OTHER_DEPTH, None, *known))
+            continue
+        given = {"seed": arguments.seed, "diameter": diameters[one.index]}
+        result = estimator.run(one.index, crop.view, crop.camera_from_crop, **given)
+        step = Step.of("that mask, with the settings asked for", one.mask, result, _score(result))
+        found.append(dataclasses.replace(one, result=result, steps=(*one.steps, step)))
+        seconds[id(found[-1])] = spent
+    return dataclasses.replace(detections, found=tuple(found), rejected=(*rejected, *lost)), seconds
+
+
+def _score(result: Any) -> float:
+    found = result.estimate
+    return float(found.confidence) * float(found.hypotheses.score[0]) if bool(found.success) else 0.0
+
+
+def _explain(name: str, detections: Any, arguments: argparse.Namespace) -> Path:
+    """Write the page of a frame; with ``--frames`` one in the folder, which is made."""
+    from ipjax.detection.explanation.page import explain
+
+    path = arguments.explain
+    if arguments.frames is not None:
+        path.mkdir(parents=True, exist_ok=True)
+        path = path / f"{name}.html"
+    explain(path, detections, name)
+    return path
+
+
+def _rejected_as_json(one: Any) -> dict[str, Any]:
+    return {
+        "object": one.name,
+        "proposal": one.proposal,
+        "similarity": one.similarity,
+        "confidence": one.confidence,
+        "score": one.score,
+        "why": one.why.value,
+        "reason": one.reason,
+        "lost_to": None if one.rival is None else dataclasses.asdict(one.rival),
+        "steps": [_step_as_json(step) for step in one.steps],
+    }
+
+
+def _step_as_json(one: Any) -> dict[str, Any]:
+    return {
+        "where": one.where,
+        "success": one.success,
+        "confidence": one.confidence,
+        "score": one.score,
+        "pixels": int(one.mask.sum()),
     }
 
 
@@ -125,6 +192,7 @@ def _about(one: Any) -> dict[str, Any]:
         "proposal": one.proposal,
         "similarity": one.similarity,
         "overlap_with_proposal": one.overlap,
+        "steps": [_step_as_json(step) for step in one.steps],
     }
 
 

@@ -47,7 +47,7 @@ def list_frames(arguments: argparse.Namespace) -> list[FrameFiles]:
     """
     if arguments.frames is None:
         return [_single_frame(arguments)]
-    for name in ("rgb", "depth", "mask", "box"):
+    for name in ("rgb", "depth", "mask", "box", "click"):
         if getattr(arguments, name) is not None:
             raise ValueError(f"--{name} belongs to a single frame; leave it out with --frames")
     folder, count = arguments.frames, len(arguments.objects)
@@ -66,6 +66,8 @@ def list_frames(arguments: argparse.Namespace) -> list[FrameFiles]:
         raise ValueError(f"{folder}: no masks in mask/, masks/ or mask_visib/")
     if masks is not None and arguments.instances != 1:
         raise ValueError(f"--instances is for objects that are sought, but {folder} has masks in {masks.name}/")
+    if masks is not None and arguments.explain is not None:
+        raise ValueError(f"--explain shows how objects are sought, but {folder} has masks in {masks.name}/")
     frames = []
     for path in found:
         depths = [folder / "depth" / f"{path.stem}{suffix}" for suffix in DEPTHS]

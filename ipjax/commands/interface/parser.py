@@ -69,6 +69,17 @@ def parse_box(text: str) -> tuple[float, ...]:
     return values
 
 
+def parse_click(text: str) -> tuple[float, ...]:
+    """``X,Y`` in pixels; argparse.ArgumentTypeError, in words, otherwise."""
+    try:
+        values = parse_numbers(text)
+    except ValueError:
+        values = ()
+    if len(values) != 2:
+        raise argparse.ArgumentTypeError(f"{text!r} is no pixel: give two numbers, X,Y, for instance 312,240")
+    return values
+
+
 def parse_camera(text: str) -> Any:
     """What `ipjax.files.cameras.reading.read_camera` takes: a file's name, or the four numbers ``fx,fy,cx,cy``."""
     parts = text.split(",")

@@ -1,12 +1,14 @@
 """Proposals of masks in an RGB-D frame: many are made, those that differ and look like things are kept."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ipjax.cameras import resize_pixels
 from ipjax.detection.proposals.candidates import Candidates, Cutting, make_candidates
 from ipjax.detection.proposals.objectness import Measures, count_votes, judge
 from ipjax.detection.proposals.planes import find_planes, mark_planes
@@ -29,6 +31,7 @@ class ProposalConfig:
     # Metres, of the things that are sought, where they are known: balls of that size are tried, too, and masks that are
     # longer than the largest are left out.
     diameters: tuple[float, ...] = ()
+    at: tuple[tuple[float, float], ...] = ()  # pixels (x, y), one of which every proposal has; none = anywhere
     seed: int = 0
 
 
@@ -66,6 +69,8 @@ def propose(rgb: Any, depth: Any, camera: Any, config: ProposalConfig | None = N
         length = np.concatenate([each.length for each in measures])
         objectness = np.where(length > _LONGER * max(config.diameters), -np.inf, objectness)
     height, width = depth.shape
+    if config.at:
+        objectness = np.where(_have(masks, config.at, (width, height)), objectness, -np.inf)
     kept = suppress(masks, objectness, config.overlap, config.most)
     kept = kept[np.isfinite(objectness[kept])]
     large = np.zeros((len(kept), height, width), bool)
@@ -128,6 +133,17 @@ def suppress(
     return order[kept]
 
 
+def _have(masks: np.ndarray, pixels: Sequence[tuple[float, float]], size: tuple[int, int]) -> np.ndarray:
+    """Which masks, at whatever resolution, have one of these pixels of an image of this width and height, or one beside
+    it: borders are that uncertain."""
+    height, width = masks.shape[1:]
+    found = np.zeros(len(masks), bool)
+    for pixel in pixels:
+        x, y = np.floor(resize_pixels(np.asarray(pixel, float), size, (width, height)) + 0.5).astype(int).tolist()
+        found |= masks[:, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2].any((1, 2))
+    return found
+
+
 def enlarge(mask: Bool[np.ndarray, "h w"], width: int, height: int) -> np.ndarray:
     """A mask at the image's size, its border smooth."""
     if mask.shape == (height, width):
@@ -155,6 +171,8 @@ def _check(rgb: Any, depth: Any, camera: Any, config: ProposalConfig) -> tuple[n
             raise ValueError("a cutting has a side of at least 32 pixels and at least 2 segments")
         if not 0 < cutting.least < cutting.largest <= 1:
             raise ValueError(f"least and largest are shares, the smaller first: {cutting.least:g}, {cutting.largest:g}")
+    if not all(0 <= x < depth.shape[1] and 0 <= y < depth.shape[0] for x, y in np.round(config.at).tolist()):
+        raise ValueError(f"at: {list(config.at)} are not all pixels of the image")
     if not all(np.isfinite(config.diameters)) or min(config.diameters, default=1) <= 0:
         raise ValueError(f"diameters are positive metres, not {list(config.diameters)}")
     with np.errstate(over="ignore", invalid="ignore"):
