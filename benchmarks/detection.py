@@ -169,15 +169,17 @@ class Bench:
         return {"obj_id": obj_id, **told}
 
 
-def spoil(mask: np.ndarray, neighbours: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """The mask as it is and made wrong in each of the ways of `WRONG_MASKS`; one that would be empty is left out."""
+def spoil(mask: np.ndarray, neighbours: list[np.ndarray], eroded: int = 4) -> dict[str, np.ndarray]:
+    """The mask as it is and made wrong in each of the ways of `WRONG_MASKS`, eroded by so many pixels; none that would
+    be empty."""
     disc = lambda radius: cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
     grown = cv2.dilate(mask.astype(np.uint8), disc(6)) > 0
-    worn = cv2.erode(mask.astype(np.uint8), disc(4)) > 0
+    worn = cv2.erode(mask.astype(np.uint8), disc(eroded)) > 0
     half = mask.copy()
     columns = np.flatnonzero(mask.any(0))
     half[:, : int(np.median(np.nonzero(mask)[1]))] = False
-    found = dict(zip(WRONG_MASKS, (mask, grown, worn, half), strict=False))
+    names = [*WRONG_MASKS[:2], f"eroded by {eroded} px", WRONG_MASKS[3]]
+    found = dict(zip(names, (mask, grown, worn, half), strict=True))
     if neighbours:
         # The part of the nearest other object that is nearest, a fifth of this one's area.
         distance = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5)

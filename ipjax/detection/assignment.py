@@ -94,13 +94,13 @@ def assign(
         if again is not None:
             why, one = again
             by = "its mask" if why is Reason.SAME_MASK else "its pose"
-            words = f"the same instance, by {by}, was found with more confidence ({one.confidence:.2f})"
+            words = f"the same instance, by {by}, was found with more confidence"
             dropped.append((claim, Verdict(why, words, one.rival)))
         elif other is not None:
-            words = f"its pixels are taken by {other.name}, which is surer ({other.confidence:.2f})"
+            words = f"its pixels are taken by {other.name}, which is surer"
             dropped.append((claim, Verdict(Reason.CLAIMED, words, other.rival)))
         elif len(mine) >= most:
-            words = f"{most} surer instance{'s were' if most > 1 else ' was'} found ({mine[-1].confidence:.2f})"
+            words = f"{most} surer instance{'s were' if most > 1 else ' was'} found"
             dropped.append((claim, Verdict(Reason.ENOUGH, words, mine[-1].rival)))
         else:
             kept.append(claim)

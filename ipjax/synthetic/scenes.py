@@ -47,6 +47,7 @@ def make_scene(
     *,
     sizes: Sequence[float] | None = None,
     clutter: int = 4,
+    touching: bool = False,
     least_visible: float = 0.5,
     sensor: Sensor = STRUCTURED_LIGHT,
     oversample: int = 3,
@@ -58,6 +59,7 @@ def make_scene(
       objects: meshes of unit diameter; each is placed on a side that it can lie on.
       sizes: their diameters in metres; drawn from 0.09 … 0.22 by default.
       clutter: how many more objects stand in the way.
+      touching: each of the objects stands against the one before it, half a millimetre from it.
       least_visible: the camera is put where at least this share of the first object's outline is seen, as far as
         forty tries allow; `Scene.visible` has what came of it.
       sensor: what the camera adds; `PERFECT` adds nothing.
@@ -76,7 +78,7 @@ def make_scene(
     cluttering = rng.choice(10 * len(KINDS), clutter, replace=False)
     meshes = [*objects, *(make_clutter(int(number)) for number in cluttering)]
     diameters = [*(drawn[: len(objects)] if sizes is None else sizes), *drawn[len(objects) :]]
-    world_from_object = place_on_table(rng, meshes, diameters)
+    world_from_object = place_on_table(rng, meshes, diameters, row=len(objects) if touching else 0)
     camera = _draw_camera(rng)
     camera_from_world = _choose_view(rng, meshes, world_from_object, camera, least_visible)
 

@@ -26,6 +26,7 @@ def place_on_table(
     *,
     gap: float = 0.004,
     touching: int = 0,
+    row: int = 0,
 ) -> list[Similarity[np.ndarray]]:
     """``world_from_object``: every mesh rests on a face of its hull, the larger the likelier, apart from others.
 
@@ -33,6 +34,7 @@ def place_on_table(
       diameters: metres.
       gap: metres between what the objects cover of the table.
       touching: of so many pairs the second object is pushed against the first: meshes 0 and 1, 2 and 3 …
+      row: so many of the first meshes are in a row, each pushed against the one before it.
     """
     poses, taken = [], []
     for mesh, diameter in zip(meshes, diameters, strict=True):
@@ -45,7 +47,7 @@ def place_on_table(
         corners = diameter * hull.points[hull.vertices] @ rotation.T
         shadow = corners[ConvexHull(corners[:, :2]).vertices, :2]
         offset = rng.uniform(-0.02, 0.02, 2)
-        pushed = len(taken) % 2 == 1 and len(taken) < 2 * touching
+        pushed = (len(taken) % 2 == 1 and len(taken) < 2 * touching) or 0 < len(taken) < row
         for attempt in range(200):
             if pushed:
                 offset = _push(rng, shadow, taken[-1])

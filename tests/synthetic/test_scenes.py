@@ -1,7 +1,10 @@
 """Drawn objects and scenes: the truth that comes with them is true. One scene without noise, one with."""
 
+import itertools
+
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from ipjax.synthetic.objects import KINDS, make_object
 from ipjax.synthetic.scenes import make_scene
@@ -85,6 +88,16 @@ def test_the_sensor_loses_and_shifts_depth(objects, scene):
     off = np.abs(noisy.depth - scene.depth)[~lost]
     assert 2e-4 < np.median(off) < 0.01
     np.testing.assert_array_equal(noisy.masks, scene.masks)
+
+
+def test_objects_touch_where_that_is_wanted():
+    """Half a millimetre apart on the table, as solid things can be."""
+    mesh = make_object("carton")
+    sizes = (0.2, 0.2, 0.2)
+    made = make_scene([mesh] * 3, 1, sizes=sizes, clutter=0, touching=True, sensor=PERFECT, oversample=1)
+    clouds = [pose.to_numpy() @ mesh.vertices for pose in made.camera_from_object]
+    gaps = [cKDTree(a).query(b)[0].min() for a, b in itertools.pairwise(clouds)]
+    assert max(gaps) < 0.02 and min(gaps) > 4e-4  # vertices lie apart from one another on their surfaces
 
 
 def test_bad_inputs_are_refused_in_words(objects):

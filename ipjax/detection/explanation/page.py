@@ -98,7 +98,7 @@ def _show_object(
         verdict = f"not here, or not seen well enough: the best guess has a confidence of {mine[0].confidence:.2f}"
     else:
         verdict = "nothing that was tried could be it"
-    accepted = {one.proposal for one in mine}
+    accepted = {one.proposal for one in hits}
     shown = max(_MOST_RANKED, ranking.estimated)
     rest = ranking.similarity[shown:]
     return {
@@ -132,7 +132,7 @@ def _praise(one: Detection) -> str:
 def _blame(one: Rejected) -> str:
     if one.rival is None:
         return one.reason
-    return f"{one.reason}: proposal {one.rival.proposal}, with {one.rival.confidence:.2f}"
+    return f"{one.reason} (proposal {one.rival.proposal}, confidence {one.rival.confidence:.2f})"
 
 
 def _show_trial(found: Detections, one: Detection | Rejected, state: str, words: str) -> dict[str, Any]:

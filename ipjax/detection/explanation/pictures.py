@@ -16,20 +16,23 @@ from ipjax.inference.drawing import PALETTE, draw_mask, draw_overlay, name_estim
 from ipjax.inference.photos.corrected_mesh import correct_info
 
 CUT, POSED = (255, 190, 0), (64, 224, 208)  # outlines of what was cut out, and of the mask that a pose gave
+_FAINT = (200, 205, 215)  # of guesses
 _HEIGHT = 900  # pixels of pictures of the whole frame
 _SIDE = 160  # pixels of a crop
 
 
 def draw_found(scene: Scene, found: Sequence[Detection]) -> UInt8[np.ndarray, "h w 3"]:
-    """The frame with outline, axes and box of every object at its pose, its mask, its name and its confidence."""
-    posed = [one for one in found if bool(one.result.estimate.success)]
+    """The frame with outline, axes and box of every object that is present, at its pose, and of guesses only the mask;
+    with names and confidences."""
+    posed = [one for one in found if one.present]
+    guesses = [one for one in found if not one.present]
     poses = [jax.tree.map(np.asarray, one.result.estimate.camera_from_object) for one in posed]
     colours = [PALETTE[number % len(PALETTE)] for number in range(len(posed))]
     infos = [correct_info(one.result) for one in posed]
     boxes = [own_box(one.result.estimate, info) for one, info in zip(posed, infos, strict=True)]
     about = scene.rgb, scene.matrix, poses, infos
     picture = draw_overlay(*about, boxes=boxes, colours=colours, height=_HEIGHT)
-    for one, colour in zip(posed, colours, strict=True):
+    for one, colour in zip([*guesses, *posed], [_FAINT] * len(guesses) + colours, strict=True):
         draw_mask(picture, one.mask, name_estimate(one.name, one.result.estimate), colour)
     return picture
 
@@ -59,8 +62,10 @@ def draw_proposals(
         cv2.drawContours(picture, outline, -1, colour, 3, cv2.LINE_AA)
         # The number stands where the mask is widest.
         depth = cv2.distanceTransform(np.pad(inside, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
-        y, x = np.unravel_index(int(depth.argmax()), depth.shape)
-        labels.append(((int(x), int(y)), str(number), colour))
+        y, x = map(int, np.unravel_index(int(depth.argmax()), depth.shape))
+        while any(abs(x - other[0]) < 30 and abs(y - other[1]) < 22 for other, _, _ in labels):
+            y += 6
+        labels.append(((x, y), str(number), colour))
     canvas = Image.fromarray(picture)
     pen = ImageDraw.Draw(canvas)
     for place, text, colour in labels:
