@@ -30,9 +30,8 @@ from ipjax import metrics
 from ipjax.bop.dataset import Dataset
 from ipjax.config import Config, DetectConfig
 from ipjax.detection.assignment import overlap
-from ipjax.detection.crops import cut_crop, read_scene
 from ipjax.detection.detector import Detector
-from ipjax.detection.rough import estimate_again
+from ipjax.detection.rough import mend_mask
 from ipjax.files.objects.loading import load
 from ipjax.files.provenance import hash_executed
 from ipjax.files.storage.writing import append_json, write_text
@@ -112,7 +111,7 @@ class Bench:
             mine, rejected = self.detector.seek(alone_sight, index, diameter=size)
             found = self.detector.choose(alone_sight, mine, rejected)
             known.append({"obj_id": obj_id, **self._judge(found, obj_id, truth)})
-        wrong = [self._wrong_masks(frame, obj_id, truths) for obj_id in truths]
+        wrong = [self._wrong_masks(sight, obj_id, truths) for obj_id in truths]
         return {
             "image": list(image),
             "proposals": len(sight.proposals.masks),
@@ -140,31 +139,27 @@ class Bench:
             told["error"] = self.error(self.objects.index(obj_id), one.result.estimate.camera_from_object, truth[0])
         return told
 
-    def _wrong_masks(self, frame: Any, obj_id: int, truths: dict[int, Any]) -> dict[str, Any]:
+    def _wrong_masks(self, sight: Any, obj_id: int, truths: dict[int, Any]) -> dict[str, Any]:
         """Errors of the pose in the annotated mask made wrong, as it is and mended."""
         index = self.objects.index(obj_id)
         truth, mask = truths[obj_id]
-        estimator, told = self.detector.estimator, {}
-        scene = read_scene(frame.rgb, frame.depth, frame.camera)
+        told: dict[str, Any] = {}
         for name, changed in spoil(mask, [other for key, (_, other) in truths.items() if key != obj_id]).items():
-            crop = cut_crop(scene, changed, **self.detector.options)
-            if crop is None:
+            mended = mend_mask(self.detector, index, sight, changed)
+            if mended is None:
                 told[name] = {"before": None, "after": None}
                 continue
-            first = estimator.run(index, crop.view, crop.camera_from_crop)
-            mended = estimate_again(estimator, index, scene, changed, first)
-            last = first if mended is None else mended.result
+            estimates = mended.first.estimate, mended.result.estimate
             errors = [
-                self.error(index, one.estimate.camera_from_object, truth) if bool(one.estimate.success) else None
-                for one in (first, last)
+                self.error(index, one.camera_from_object, truth) if bool(one.success) else None for one in estimates
             ]
             told[name] = {
                 "before": errors[0],
                 "after": errors[1],
                 "iou_before": overlap(changed, mask),
-                "iou_after": overlap(changed if mended is None else mended.mask, mask),
-                "confidence_before": float(first.estimate.confidence),
-                "confidence_after": float(last.estimate.confidence),
+                "iou_after": overlap(mended.mask, mask),
+                "confidence_before": float(estimates[0].confidence),
+                "confidence_after": float(estimates[1].confidence),
             }
         return {"obj_id": obj_id, **told}
 

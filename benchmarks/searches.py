@@ -33,6 +33,7 @@ from ipjax.config import Config
 from ipjax.detection.assignment import overlap, shared_share
 from ipjax.detection.crops import cut_crop
 from ipjax.detection.detector import Detector
+from ipjax.detection.rough import mend_mask
 from ipjax.files.meshes.mesh import normalise
 from ipjax.files.objects.loading import load
 from ipjax.files.storage.writing import write_text
@@ -193,23 +194,26 @@ def _count_instances(bench: Bench, index: int, scene: Any, count: int) -> dict[s
 
 def try_masks(bench: Bench, images: int | None) -> list[dict[str, Any]]:
     """A line for each target."""
-    from ipjax.detection.rough import mend_mask
-
-    detector, lines = bench.detector, []
+    detector, lines, sights = bench.detector, [], {}
     for frame, obj_id, truth, masks in bench.targets(images, apart=True):
         index = bench.objects.index(obj_id)
-        about = frame.rgb, frame.depth, frame.camera
+        key = id(frame)
+        if key not in sights:
+            sights = {key: detector.look(frame.rgb, frame.depth, frame.camera)}
         others = [mask for other, mask in masks.items() if other != obj_id]
         line: dict[str, Any] = {"obj_id": obj_id}
         for name, given in spoil(masks[obj_id], others, eroded=6).items():
             start = time.process_time()
-            mended = mend_mask(detector, index, *about, given)
-            line[name] = {
-                "before": bench.judge(obj_id, mended.first.estimate, truth) | {"iou": overlap(given, masks[obj_id])},
-                "after": bench.judge(obj_id, mended.result.estimate, truth)
-                | {"iou": overlap(mended.mask, masks[obj_id])},
-                "cpu": time.process_time() - start,
+            mended = mend_mask(detector, index, sights[key], given)
+            spent = time.process_time() - start
+            kinds = [("before", None, given), ("after", None, given)]
+            if mended is not None:
+                kinds = [("before", mended.first.estimate, given), ("after", mended.result.estimate, mended.mask)]
+            told = {
+                when: bench.judge(obj_id, found, truth) | {"iou": overlap(mask, masks[obj_id])}
+                for when, found, mask in kinds
             }
+            line[name] = told | {"cpu": spent}
         lines.append(line)
     return lines
 

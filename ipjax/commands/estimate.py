@@ -184,7 +184,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         objects, encoder, config, quick=not many, crop=arguments.crop, depth_scale=arguments.depth_scale
     )
     detector = None
-    if any(is_without_masks(files) for files in frames if not files.error):
+    sought = any(is_without_masks(files) for files in frames if not files.error)
+    if sought or arguments.mask_is_rough:
         detector = make_detector(objects, encoder, quick=not many, crop=arguments.crop)
     entries: list[dict[str, Any]] = []
     for files in frames:
@@ -229,7 +230,7 @@ def _estimate_frame(
 ) -> dict[str, Any]:
     """Estimate the objects of one frame and draw its overlay; returns its entry in the result.
 
-    ``images``: the frame, where it has been read already. ``detector``: for frames without masks.
+    ``images``: the frame, where it has been read already. ``detector``: for frames without masks, or with rough ones.
     """
     warned = len(messages.warnings)
     infos = [info for _, info in estimator.objects]
@@ -243,7 +244,7 @@ def _estimate_frame(
         found, detection = detect_frame(files.name, images, detector, estimator, diameters, arguments, messages)
         entries = [_entry(one, infos, arguments) | {"mask": None, "detected": one.about} for one in found]
     else:
-        found, entries = _estimate_masks(files, images, estimator, diameters, arguments, messages)
+        found, entries = _estimate_masks(files, images, estimator, detector, diameters, arguments, messages)
     results = [one.result for one in found if one.result is not None]
     for result in results:
         for line in result.warnings:
@@ -290,6 +291,7 @@ def _estimate_masks(
     files: FrameFiles,
     images: Images,
     estimator: Any,
+    detector: Any,
     diameters: list[float | None],
     arguments: argparse.Namespace,
     messages: Messages,
@@ -306,7 +308,7 @@ def _estimate_masks(
         start = time.perf_counter()
         crop = estimator.frame(i, images.rgb, images.depth, mask, images.camera, box)
         crops.append((crop, time.perf_counter() - start))
-    found, entries = [], []
+    found, entries, sight = [], [], None
     for i, cut in enumerate(crops):
         info = infos[i]
         options: dict[str, Any] = {"seed": arguments.seed, "diameter": diameters[i]}
@@ -323,7 +325,9 @@ def _estimate_masks(
         if arguments.mask_is_rough and masks is not None:
             messages.print_notes()
             chosen = 0 if tried is None else next(k for k, one in enumerate(tried) if one["chosen"])
-            about = files.name, images, estimator, i, result, masks[chosen].mask, messages, arguments.depth_scale
+            if sight is None:
+                sight = detector.look(images.rgb, images.depth, images.camera, arguments.depth_scale)
+            about = files.name, images, sight, detector, estimator, i, result, masks[chosen].mask, messages
             result, mended, mask = mend_mask(*about, **options)
         found.append(Found(i, result, mask, seconds, diameters[i], None))
         path = None if files.masks[i] is None else str(files.masks[i])

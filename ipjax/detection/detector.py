@@ -1,7 +1,7 @@
 """Objects in frames without masks: proposals, described once, ranked for each object, verified by their poses."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -208,12 +208,8 @@ class Detector:
         """
         if click is not None:
             sight.clicks[index] = click
-        order = self._rank(sight, index, self.detection.verified + 2 * (instances - 1), click)
-        candidates = [
-            Candidate(index, i, float(sight.similarity[index, i]), sight.proposals.masks[i], crop)
-            for i in order
-            if (crop := sight.crops[i]) is not None
-        ]
+        is_there = None if click is None else lambda mask: is_at(mask, click)
+        candidates = self.rank(sight, index, self.detection.verified + 2 * (instances - 1), is_there)
         about = self.estimator, self.detection, self.options, sight.scene, sight.watch
         verifier = Verifier(*about, diameter=diameter, click=click, seed=seed)
         return verifier.verify(candidates, instances), verifier.rejected
@@ -243,19 +239,16 @@ class Detector:
         about = sight.proposals, sight.similarity, sight.scene, seconds, tuple(self.names), rankings, clicks
         return Detections(found, (*rejected, *lost), *about)
 
-    def _glance_all(self, crops: Sequence[Crop], watch: Stopwatch) -> Signature:
-        encoder = self.estimator.encoder
-        look = lambda encoder, view: glance(encoder, view, self.zoom)
-        found = []
-        for crop in crops:
-            compiled = self.estimator.compiled("glance", look, watch.spent, encoder, crop.view)
-            found.append(compiled(encoder, crop.view))
-        # Padded to a multiple, so that frames of other numbers of proposals take the same program.
-        found += [found[0]] * (-len(found) % _BUCKET)
-        return jax.block_until_ready(jax.tree.map(lambda *x: jnp.stack(x), *found))
+    def rank(
+        self, sight: Sight, index: int, count: int, fits: Callable[[np.ndarray], bool] | None = None
+    ) -> list[Candidate]:
+        """The ``count`` proposals most like an object, the best first: chosen at a glance, ranked by whole crops.
 
-    def _rank(self, sight: Sight, index: int, count: int, click: tuple[float, float] | None) -> list[int]:
-        """The ``count`` proposals most like an object, the best first: chosen at a glance, ranked by whole crops."""
+        Args:
+            sight: from `look`.
+            index: of the object.
+            fits: whether a mask may be its; None = any may.
+        """
         if sight.signatures is None:
             return []
         if index not in self._signatures:
@@ -269,8 +262,8 @@ class Detector:
 
         mine[sight.used] = rate(sight.signatures)[: len(sight.used)]
         masks = sight.proposals.masks
-        fits = [i for i in range(len(mine)) if np.isfinite(mine[i]) and (click is None or is_at(masks[i], click))]
-        order = np.array(fits, int)[np.argsort(-mine[fits], kind="stable")]
+        left = [i for i in range(len(mine)) if np.isfinite(mine[i]) and (fits is None or fits(masks[i]))]
+        order = np.array(left, int)[np.argsort(-mine[left], kind="stable")]
         most = max(settings.shortlist, count)
         best = [int(i) for i in order[:most]]
         if best:
@@ -282,7 +275,19 @@ class Detector:
             order[: len(best)] = best
         estimated = min(count, len(best))
         sight.rankings[index] = Ranking(index, self.names[index], order, mine[order], len(best), estimated)
-        return best[:count]
+        chosen = [(i, sight.crops[i]) for i in best[:count]]
+        return [Candidate(index, i, float(mine[i]), masks[i], crop) for i, crop in chosen if crop is not None]
+
+    def _glance_all(self, crops: Sequence[Crop], watch: Stopwatch) -> Signature:
+        encoder = self.estimator.encoder
+        look = lambda encoder, view: glance(encoder, view, self.zoom)
+        found = []
+        for crop in crops:
+            compiled = self.estimator.compiled("glance", look, watch.spent, encoder, crop.view)
+            found.append(compiled(encoder, crop.view))
+        # Padded to a multiple, so that frames of other numbers of proposals take the same program.
+        found += [found[0]] * (-len(found) % _BUCKET)
+        return jax.block_until_ready(jax.tree.map(lambda *x: jnp.stack(x), *found))
 
     def _signature(self, sight: Sight, proposal: int) -> Signature:
         """Of a whole crop, which is described when it is first wanted."""

@@ -75,22 +75,29 @@ class Verifier:
     rejected: list[Rejected] = dataclasses.field(default_factory=list)
 
     def verify(self, candidates: Sequence[Candidate], instances: int) -> list[Claim]:
-        """The poses of candidates, the pixels that they claim; what does not differ is estimated once.
+        """The poses of candidates, the pixels that they claim; what does not differ is estimated once."""
+        return self.settle([self.attempt(one) for one in candidates], instances)
+
+    def settle(self, trials: Sequence[Trial], instances: int) -> list[Claim]:
+        """The second half of `verify`: the poses of candidates that were estimated.
 
         Where more than one instance is wanted, what a pose leaves of its proposal may be another: two that touch are
         often one proposal.
         """
-        trials = [self._try(one, "verify") for one in candidates]
         chosen: list[Trial] = []
         mended = self._mend(trials, chosen, self.settings.mended + instances - 1)
         found = list(mended)
         while mended and instances > 1 and len(found) < self.settings.mended + 2 * instances:
             rests = [rest for trial in mended if (rest := self._rest(trial)) is not None]
-            mended = self._mend([self._try(one, "verify rest", REST) for one in rests], chosen, len(chosen) + instances)
+            again = [self.attempt(one, "verify rest", REST) for one in rests]
+            mended = self._mend(again, chosen, len(chosen) + instances)
             found += mended
         return self._claims(found)
 
-    def _try(self, candidate: Candidate, stage: str, where: str = PROPOSAL, earlier: tuple[Step, ...] = ()) -> Trial:
+    def attempt(
+        self, candidate: Candidate, stage: str = "verify", where: str = PROPOSAL, earlier: tuple[Step, ...] = ()
+    ) -> Trial:
+        """Estimate a candidate; ``stage`` is what the seconds are counted as, ``where`` what was cut out, in words."""
         crop = candidate.crop
         patches = describe_crop(self.estimator, crop, self.watch)
         about = crop.view, crop.camera_from_crop
@@ -140,7 +147,7 @@ class Verifier:
                 else:
                     again = dataclasses.replace(trial.candidate, crop=crop)
                     earlier = *trial.earlier, trial.as_step(mask)
-                    mended.append(self._try(again, "verify again", POSED, earlier))
+                    mended.append(self.attempt(again, "verify again", POSED, earlier))
         return mended
 
     def _rest(self, trial: Trial) -> Candidate | None:

@@ -199,42 +199,54 @@ def _about(one: Any) -> dict[str, Any]:
 def mend_mask(
     name: str,
     images: Images,
+    sight: Any,
+    detector: Any,
     estimator: Any,
     index: int,
     first: Any,
     mask: Any,
     messages: Messages,
-    depth_scale: float | None,
     **options: Any,
 ) -> tuple[Any, dict[str, Any] | None, Any]:
-    """``--mask-is-rough``: estimate again in the mask of the pose.
+    """``--mask-is-rough``: estimate again in the mask that the best pose gives.
+
+    Args:
+        sight: of `ipjax.Detector.look` at the frame.
+        first: the estimate in the given mask.
+        options: of `ipjax.Estimator.run`.
 
     Returns:
         The surer result, what changed as JSON (None where there is no mask to mend), and the mask.
     """
-    from ipjax.detection.crops import read_scene, undistort_mask
-    from ipjax.detection.rough import estimate_again
+    from ipjax.detection.crops import cut_crop, undistort_mask
+    from ipjax.detection.rough import mend_mask, rate_pose
     from ipjax.files.images.run_lengths import encode_rle
 
     info = estimator.objects[index][1]
-    scene = read_scene(images.rgb, images.depth, images.camera, depth_scale)
     given = undistort_mask(mask, images.camera)
-    mended = estimate_again(estimator, index, scene, given, first, **options)
-    if mended is None:
-        messages.note(f"{name}: {info.name}: the mask was kept: its pose gives none")
+    mended = mend_mask(detector, index, sight, given, **options)
+    cut = {"resolution": info.resolution, "crop": estimator.options["crop"]}
+    crop = None if mended is None else cut_crop(sight.scene, mended.mask, **cut)
+    if mended is None or crop is None:
+        messages.note(f"{name}: {info.name}: the mask was kept: no pose gives another")
         return first, None, given
-    after = float(mended.result.estimate.confidence)
-    outcome = f"confidence {mended.before:.2f} → {after:.2f}" if mended.used else "kept as it was: it is the surer one"
+    again = estimator.run(index, crop.view, crop.camera_from_crop, **options)
+    rate = lambda result: rate_pose(result, given, sight.scene, detector.detection)
+    used = rate(again) >= rate(first)
+    before, after = (float(result.estimate.confidence) for result in (first, again))
+    outcome = f"confidence {before:.2f} → {after:.2f}" if used else "kept as it was: it is the surer one"
+    by = "" if mended.proposal is None else f", by proposal {mended.proposal}"
     messages.note(
         f"{name}: {info.name}: of the mask {mended.removed} pixels are not the object's and {mended.added} are missing "
-        f"(overlap {mended.overlap:.2f}); {outcome}"
+        f"(overlap {mended.overlap:.2f}{by}); {outcome}"
     )
     about = {
         "overlap": mended.overlap,
         "added_pixels": mended.added,
         "removed_pixels": mended.removed,
-        "used": mended.used,
-        "confidence_before": mended.before,
+        "proposal": mended.proposal,
+        "used": used,
+        "confidence_before": before,
         "mask": encode_rle(mended.mask),
     }
-    return mended.result, about, mended.mask if mended.used else given
+    return (again, about, mended.mask) if used else (first, about, given)
