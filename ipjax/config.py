@@ -195,6 +195,7 @@ class DetectConfig(eqx.Module):
     alike: int = _static(3, least=1)  # templates whose similarity to a crop is averaged
     colour: float = 0.5  # weight of colours beside whole features and features by cells, which have 1 each
     verified: int = _static(4, least=1)  # proposals whose pose is estimated, of each object; two more for each instance
+    clicked: int = _static(8, least=1)  # the same of those at a click, which are much alike
     mended: int = _static(2, least=1)  # of their poses that give a mask, in which it is estimated again; likewise
     same: float = 0.1  # poses whose surfaces lie on average within this, in diameters, are of one instance
     tolerance: float = 0.05  # depth off the posed object's by more than this is not the object's; diameters

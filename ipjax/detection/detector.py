@@ -209,7 +209,8 @@ class Detector:
         if click is not None:
             sight.clicks[index] = click
         is_there = None if click is None else lambda mask: is_at(mask, click)
-        candidates = self.rank(sight, index, self.detection.verified + 2 * (instances - 1), is_there)
+        first = self.detection.verified if click is None else self.detection.clicked
+        candidates = self.rank(sight, index, first + 2 * (instances - 1), is_there)
         about = self.estimator, self.detection, self.options, sight.scene, sight.watch
         verifier = Verifier(*about, diameter=diameter, click=click, seed=seed)
         return verifier.verify(candidates, instances), verifier.rejected

@@ -23,6 +23,8 @@ ELSEWHERE = Verdict(Reason.OTHER_DEPTH, "the depth where its pose is belongs to 
 OFF_CLICK = Verdict(Reason.OFF_CLICK, "its pose is not at the click")
 PROPOSAL, REST, POSED = "a proposal", "what another instance left of a proposal", "the mask of its pose"
 NEAR = 5  # pixels beside a mask at which a click is still on it
+AT_CLICK = 2  # poses that are mended there, besides those of any search
+CLOSE = 0.02  # diameters of ADD-S within which poses at a click are as good as one
 BESIDE = 3  # pixels beside a pose's outline that are not left to another instance
 LEAST_REST = 150  # pixels of a proposal that its pose must leave for another instance to be sought there
 REST_SHARE = 0.25  # and that share of the pose's own outline
@@ -85,7 +87,8 @@ class Verifier:
         often one proposal.
         """
         chosen: list[Trial] = []
-        mended = self._mend(trials, chosen, self.settings.mended + instances - 1)
+        most = self.settings.mended + (instances - 1 if self.click is None else AT_CLICK)
+        mended = self._mend(trials, chosen, most)
         found = list(mended)
         while mended and instances > 1 and len(found) < self.settings.mended + 2 * instances:
             rests = [rest for trial in mended if (rest := self._rest(trial)) is not None]
@@ -120,23 +123,19 @@ class Verifier:
         """The best poses that differ, estimated again in the masks that they give; ``chosen`` has them, too."""
         mended: list[Trial] = []
         for trial in sorted(trials, key=lambda one: -one.value):
-            found = trial.result.estimate
-            templates, pose = trial.result.templates, found.camera_from_object
-            apart = self.settings.same
             if trial.value <= 0:
                 self._reject(trial, Verdict(Reason.NO_POSE, "no pose was found"))
                 continue
-            placed = lambda one: one.result.estimate.camera_from_object
-            again = (one for one in chosen if same_instance(templates, placed(one), pose, apart))
-            if (other := next(again, None)) is not None:
+            if (other := next((one for one in chosen if self._is_same(trial, one)), None)) is not None:
                 words = "another proposal led to the same pose, and is surer"
                 self._reject(trial, Verdict(Reason.SAME_POSE, words, other.rival))
             elif len(chosen) >= most:
                 words = "other proposals have surer poses"
                 self._reject(trial, Verdict(Reason.WEAKER, words, chosen[-1].rival))
             else:
+                about = trial.result.templates, trial.result.estimate.camera_from_object
                 with self.watch("mask"):
-                    mask, whole = mask_from_pose(templates, pose, self.scene.matrix, self.scene.depth, self.settings)
+                    mask, whole = mask_from_pose(*about, self.scene.matrix, self.scene.depth, self.settings)
                     crop = cut_crop(self.scene, mask, **self.options)
                 if self.click is not None and not is_at(whole, self.click):
                     self._reject(trial, OFF_CLICK, mask)
@@ -149,6 +148,13 @@ class Verifier:
                     earlier = *trial.earlier, trial.as_step(mask)
                     mended.append(self.attempt(again, "verify again", POSED, earlier))
         return mended
+
+    def _is_same(self, trial: Trial, other: Trial) -> bool:
+        """Whether one of two poses is enough: they are of one instance or, where a click says which instance that is and
+        nearly all poses are of it, hardly differ."""
+        apart = self.settings.same if self.click is None else CLOSE
+        poses = (one.result.estimate.camera_from_object for one in (trial, other))
+        return same_instance(trial.result.templates, *poses, apart)
 
     def _rest(self, trial: Trial) -> Candidate | None:
         """The largest piece of a proposal that its pose leaves; None where that is too little for another instance."""
