@@ -150,7 +150,7 @@ class Verifier:
         return mended
 
     def _is_same(self, trial: Trial, other: Trial) -> bool:
-        """Whether one of two poses is enough: they are of one instance or, where a click says which instance that is and
+        """Whether one of two poses is enough: they are of one instance or, where a click says which that is and
         nearly all poses are of it, hardly differ."""
         apart = self.settings.same if self.click is None else CLOSE
         poses = (one.result.estimate.camera_from_object for one in (trial, other))
