@@ -86,12 +86,12 @@ class Bench:
         mssd = float(metrics.mssd(*given)) / model.diameter
         return {"add_s": float(add_s), "mssd": mssd, "confidence": float(estimate.confidence)}
 
-    def targets(self, images: int | None, apart: bool = False) -> Iterator[tuple[Any, int, Any, dict[int, np.ndarray]]]:
+    def targets(self, images: slice, apart: bool = False) -> Iterator[tuple[Any, int, Any, dict[int, np.ndarray]]]:
         """Frame, object and truth of every target, and all masks of its image; ``apart``: one image of each scene."""
         chosen = self.dataset.target_images
         if apart:
             chosen = list({scene: (scene, image) for scene, image in reversed(chosen)}.values())[::-1]
-        for image in bar(chosen[:images], desc=self.dataset.name, unit=" images"):
+        for image in bar(chosen[images], desc=self.dataset.name, unit=" images"):
             frame = self.dataset.frame(*image)
             truths = {one.obj_id: one for one in self.dataset.truths(*image)}
             masks = {obj_id: self.dataset.mask(*image, one.index) for obj_id, one in truths.items()}
@@ -100,7 +100,7 @@ class Bench:
                     yield frame, row.obj_id, truths[row.obj_id], masks
 
 
-def try_hints(bench: Bench, images: int | None) -> list[dict[str, Any]]:
+def try_hints(bench: Bench, images: slice) -> list[dict[str, Any]]:
     """A line for each target."""
     detector, lines, sights = bench.detector, [], {}
     for frame, obj_id, truth, masks in bench.targets(images):
@@ -192,7 +192,7 @@ def _count_instances(bench: Bench, index: int, scene: Any, count: int) -> dict[s
     }
 
 
-def try_masks(bench: Bench, images: int | None) -> list[dict[str, Any]]:
+def try_masks(bench: Bench, images: slice) -> list[dict[str, Any]]:
     """A line for each target."""
     detector, lines, sights = bench.detector, [], {}
     for frame, obj_id, truth, masks in bench.targets(images, apart=True):
@@ -303,8 +303,8 @@ def write_page(path: Path, studies: list[dict[str, Any]]) -> None:
     text += ["## How", ""]
     for one in studies:
         head = one["head"]
-        text += [f"* {one['study']}, {one['data']}: {head['device']}, {head['cores']} cores, jax {head['jax']}, commit"]
-        text += [f"  {head['commit']}, {head['date']}: `{head['command']}`."]
+        about = f"{head['device']}, {head['cores']} cores, jax {head['jax']}, commit {head['commit']}, {head['date']}"
+        text += [f"* {one['study']}, {one['data']}: {about}:", f"  `{head['command']}`."]
     write_text(path, "\n".join(text) + "\n")
 
 
@@ -325,6 +325,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--alignment", type=parse_file, nargs="+", default=[], metavar="N=JSON", help="of their meshes")
     parser.add_argument("--models", type=Path, help="another data set, to take the models from where DATA has none")
     parser.add_argument("--images", type=int, metavar="N", help="the first N images (of masks: of scenes)")
+    parser.add_argument("--skip", type=int, default=0, metavar="N", help="but for these first ones")
     parser.add_argument("--seeds", type=int, default=1, help="made scenes of each kind")
     parser.add_argument("--weights", help="of the encoder")
     parser.add_argument("--name", help="of the data, on the page")
@@ -354,16 +355,17 @@ def measure(options: argparse.Namespace, parser: argparse.ArgumentParser) -> Non
     files |= dict(options.object)
     bench = Bench(dataset, files, dict(options.alignment), load_encoder(options.weights))
     if options.study == "hints":
-        lines = try_hints(bench, options.images)
+        lines = try_hints(bench, slice(options.skip, options.images))
     elif options.study == "instances":
         lines = try_instances(bench, options.seeds)
     else:
-        lines = try_masks(bench, options.images)
+        lines = try_masks(bench, slice(options.skip, options.images))
     name = options.name or dataset.name
     words = [f"python -m benchmarks.searches {options.study} {options.data.name}", "--objects FOLDER"]
     words += [f"--only {' '.join(map(str, options.only))}"] if options.only else []
     words += [f"--object {options.object[0][0]}=FILE --alignment {options.object[0][0]}=JSON"] if options.object else []
     words += [f"--images {options.images}"] if options.images else []
+    words += [f"--skip {options.skip}"] if options.skip else []
     words += [f"--seeds {options.seeds}"] if options.study == "instances" else []
     head = {**describe_device(), "commit": commit(), "date": time.strftime("%Y-%m-%d"), "command": " ".join(words)}
     options.output.mkdir(parents=True, exist_ok=True)

@@ -49,7 +49,11 @@ class Candidates:
 
 
 def make_candidates(
-    surfaces: Surfaces, on: Bool[np.ndarray, "h w"], cutting: Cutting, diameters: Sequence[float] = ()
+    surfaces: Surfaces,
+    on: Bool[np.ndarray, "h w"],
+    cutting: Cutting,
+    diameters: Sequence[float] = (),
+    at: Sequence[tuple[float, float]] = (),
 ) -> Candidates:
     """Every mask of a frame at its resolution, of the sizes that are allowed.
 
@@ -58,6 +62,7 @@ def make_candidates(
       on: the pixels of large planes.
       cutting: how it is cut up.
       diameters: metres, of the things that are sought, where they are known.
+      at: pixels (x, y) of these surfaces, one of which all that is sought has; none = anywhere.
     """
     segments = make_segments(surfaces, cutting.segments, cutting.compactness)
     members, ways = _join(surfaces, segments, on, cutting)
@@ -66,7 +71,7 @@ def make_candidates(
     kinds = [
         find_components(surfaces, off, least=least),
         find_basins(surfaces, least=least),
-        find_windows(surfaces, off, diameters, least=least),
+        find_windows(surfaces, off, diameters, least=least, at=at),
     ]
     kinds = [kind[kind.mean((1, 2)) <= cutting.largest] for kind in kinds]
     pieces = np.concatenate(kinds)

@@ -15,6 +15,7 @@ from ipjax.detection.proposals.planes import find_planes, mark_planes
 from ipjax.detection.proposals.surfaces import make_surfaces
 from ipjax.files.cameras.reading import as_intrinsics
 
+_SIZES = (0.05, 0.07, 0.1, 0.14, 0.2, 0.28)  # metres, of balls that are tried at a click where no size is known
 _LONGER = 1.4  # times its diameter: a thing is not seen longer than that, depth and masks being what they are
 
 
@@ -94,7 +95,12 @@ def make_all(rgb: np.ndarray, depth: np.ndarray, matrix: np.ndarray, config: Pro
         if not index:
             planes = find_planes(surfaces, config.planes, config.plane_tolerance, config.plane_share, config.seed)
         on = mark_planes(surfaces, planes, config.plane_tolerance)
-        made.append(make_candidates(surfaces, on, cutting, config.diameters if not index else ()))
+        if index:
+            made.append(make_candidates(surfaces, on, cutting))
+            continue
+        pixels = [tuple(resize_pixels(np.asarray(one, float), (width, height), small).tolist()) for one in config.at]
+        sizes = config.diameters or (_SIZES if pixels else ())
+        made.append(make_candidates(surfaces, on, cutting, sizes, pixels))
     return made
 
 

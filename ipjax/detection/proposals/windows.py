@@ -14,7 +14,11 @@ _MOST = 150  # balls of one diameter
 
 
 def find_windows(
-    surfaces: Surfaces, off: Bool[np.ndarray, "h w"], diameters: Sequence[float], least: int = 30
+    surfaces: Surfaces,
+    off: Bool[np.ndarray, "h w"],
+    diameters: Sequence[float],
+    least: int = 30,
+    at: Sequence[tuple[float, float]] = (),
 ) -> Bool[np.ndarray, "n h w"]:
     """The surface inside balls that were moved to where it is.
 
@@ -23,6 +27,7 @@ def find_windows(
       off: the pixels that may belong to a window.
       diameters: of the things that are sought, metres.
       least: pixels below which a window is dropped.
+      at: pixels (x, y) that balls begin at, instead of all over.
     """
     found = []
     focal = float(np.sqrt(surfaces.camera[0, 0] * surfaces.camera[1, 1]))
@@ -31,6 +36,9 @@ def find_windows(
         apart = np.maximum(_STEP * diameter * focal / surfaces.depth, 2)
         y, x = np.indices(surfaces.shape)
         begins = off & (x % apart < 1) & (y % apart < 1)
+        if at:
+            near = [np.hypot(x - column, y - row) <= 2 for column, row in at]
+            begins = off & np.any(near, axis=0)
         begins = np.flatnonzero(begins)
         if begins.size > _MOST:
             begins = begins[np.linspace(0, begins.size - 1, _MOST).astype(int)]
