@@ -57,7 +57,7 @@ class Step:
     confidence: float
     score: float  # confidence × agreement of the pose, and how well a known size agrees
     diameter: float  # metres
-    camera_from_object: Similarity
+    camera_from_object: Similarity[np.ndarray]
     posed: Bool[np.ndarray, "h w"] | None = None  # the mask that the pose gives; None where it was not asked
 
     @staticmethod

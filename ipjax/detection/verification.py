@@ -153,8 +153,8 @@ class Verifier:
         """Whether one of two poses is enough: they are of one instance or, where a click says which that is and
         nearly all poses are of it, hardly differ."""
         apart = self.settings.same if self.click is None else CLOSE
-        poses = (one.result.estimate.camera_from_object for one in (trial, other))
-        return same_instance(trial.result.templates, *poses, apart)
+        first, second = (one.result.estimate.camera_from_object for one in (trial, other))
+        return same_instance(trial.result.templates, first, second, apart)
 
     def _rest(self, trial: Trial) -> Candidate | None:
         """The largest piece of a proposal that its pose leaves; None where that is too little for another instance."""
