@@ -65,6 +65,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     work.mkdir(parents=True, exist_ok=True)
     write_tracks(work / "tracks.npz", found.tracks)
     write_image(work / "trajectory.png", picture)
+    (work / "ignore.png").unlink(missing_ok=True)  # of an earlier run; `refine` takes it for this one's
     if found.still.any():
         write_image(work / "ignore.png", found.still.astype("uint8") * 255)
     write_trajectory(work / "poses.json", found.trajectory)
