@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.models.making import ObjectModel
@@ -179,7 +179,7 @@ def replace_model(info: ObjectInfo, fused: FusedPose) -> ObjectModel:
     return ObjectModel(info.name, mesh, rigid, find_symmetries(mesh))
 
 
-def _spread(area: Float[np.ndarray, " v"], count: int) -> list[int]:
+def _spread(area: Int[np.ndarray, " v"], count: int) -> list[int]:
     """Frames that show much of a thing, from all around: the best of each stretch of the trajectory."""
     stretches = np.array_split(np.arange(len(area)), min(count, len(area)))
     chosen = [int(part[area[part].argmax()]) for part in stretches]
