@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ipjax.cameras import crop, project
+from ipjax.capture.labels.borders import snap
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.models.making import ObjectModel
 from ipjax.records import Camera
@@ -22,7 +23,7 @@ class FrameLabels:
     """What is known of one frame, an entry for every model."""
 
     camera_from_model: tuple[Similarity[np.ndarray], ...]
-    whole: Bool[np.ndarray, "n h w"]  # the model drawn alone
+    whole: Bool[np.ndarray, "n h w"]  # the model drawn alone, and what is visible beyond it
     visible: Bool[np.ndarray, "n h w"]
     drawn: tuple[int, ...]  # pixels of the whole silhouette, those outside the image included
     box: tuple[tuple[int, int, int, int], ...]  # x, y, width, height of the whole silhouette; −1 where there is none
@@ -85,19 +86,21 @@ def label_frames(
     for number, frame in enumerate(frames):
         silhouettes = alone.depth[number * len(models) : (number + 1) * len(models)] > 0
         whole = silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width]
+        ids, drawn = together.ids[number], together.depth[number]
+        ids = snap(frame.rgb, settle(ids, drawn, frame), len(models), frame.usable)
+        visible = np.stack([ids == k for k in range(len(models))])
+        whole, silhouettes = whole | visible, silhouettes.copy()
+        silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width] |= visible
         boxes = []
         for mask in silhouettes:
             x, y, w, h = find_box(mask)
             boxes.append((x - rim[0], y - rim[1], w, h) if w > 0 else (-1, -1, -1, -1))
-        ids, drawn = together.ids[number], together.depth[number]
-        ids = settle(ids, drawn, frame)
-        visible = np.stack([ids == k for k in range(len(models))])
         found.append(
             FrameLabels(
                 tuple(poses[number]),
-                whole | visible,
+                whole,
                 visible,
-                tuple(int(v) for v in np.maximum(silhouettes.sum((1, 2)), (whole | visible).sum((1, 2)))),
+                tuple(int(v) for v in silhouettes.sum((1, 2))),
                 tuple(boxes),
                 drawn,
             )
