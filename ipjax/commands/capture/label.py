@@ -62,7 +62,6 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
             f"{root}: it is there, and no data set of ipjax capture; it is not replaced: give another name"
         )
     notes: list[str] = []
-    frames = list(frames)
     with Bars(quiet=arguments.quiet) as bars:
         if arguments.known:
             from ipjax.commands.capture.known import place_known

@@ -27,6 +27,9 @@ and NAME_points.ply of each object, scene.ply and scene_points.ply, models.json;
 """
 
 
+_IN_MEMORY = 100_000_000  # pixels of all frames together: about 1 GB
+
+
 def add(steps: Any) -> None:
     """The step and its options."""
     parser = add_command(steps, "model", run, "make models of the objects and of the scene", EXAMPLES)
@@ -107,7 +110,10 @@ def open_frames(arguments: argparse.Namespace, work: Path) -> Any:
     ignore = read_mask(hidden) if hidden.is_file() else None
     if ignore is not None and ignore.shape != capture.size[::-1]:
         raise CaptureError(f"{hidden}: it is of another size than the frames, {capture.size[0]} × {capture.size[1]}")
-    return CaptureFrames(capture, read_trajectory(found), folder if folder.is_dir() else None, ignore)
+    frames = CaptureFrames(capture, read_trajectory(found), folder if folder.is_dir() else None, ignore)
+    # Every frame is looked at several times: short captures are kept in memory.
+    pixels = len(frames) * capture.size[0] * capture.size[1]
+    return list(frames) if pixels < _IN_MEMORY else frames
 
 
 def find_poses(work: Path) -> Path | None:
