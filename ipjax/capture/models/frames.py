@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from ipjax.cameras import unproject
 from ipjax.capture.records import Capture, CaptureError, Trajectory
 from ipjax.files.images.depth import read_depth
+from ipjax.files.images.opening import read_rgb
 from ipjax.transforms import Similarity
 
 UNIT = 0.0001  # metres per number of the depth images that the step depth writes
@@ -48,11 +49,11 @@ class CaptureFrames(Sequence[PosedFrame]):
         self,
         capture: Capture,
         trajectory: Trajectory,
-        depth: Path | None = None,
+        improved: Path | None = None,
         ignore: Bool[np.ndarray, "h w"] | None = None,
     ):
-        """A folder of depth images, as the step depth leaves it, replaces the capture's own; ``ignore``: what moves
-        with the camera, beside what the capture says itself.
+        """Frames with the depth and confidence that the step depth left in the folder ``improved``, in place of the
+        capture's own. ``ignore``: what moves with the camera, beside what the capture says itself.
 
         Raises:
           CaptureError: capture and trajectory are not of the same frames, or fewer than two have a pose.
@@ -61,7 +62,7 @@ class CaptureFrames(Sequence[PosedFrame]):
         missing = [name for name in capture.names if name not in places]
         if missing:
             raise CaptureError(f"{capture.folder}: the poses lack frame {missing[0]} and {len(missing) - 1} more")
-        self._capture, self._trajectory, self._depth = capture, trajectory, depth
+        self._capture, self._trajectory, self._improved = capture, trajectory, improved
         self._ignore = ignore
         self._rows = [
             (index, places[name]) for index, name in enumerate(capture.names) if trajectory.registered[places[name]]
@@ -86,7 +87,9 @@ class CaptureFrames(Sequence[PosedFrame]):
             return [self[i] for i in range(*index.indices(len(self)))]
         place, row = self._rows[index]
         frame = self._capture.read_frame(place)
-        depth = frame.depth if self._depth is None else read_improved(self._depth, frame.name)
+        depth, confidence = frame.depth, None
+        if self._improved is not None:
+            depth, confidence = read_improved(self._improved, frame.name)
         if depth is None:
             raise CaptureError(
                 f"{self._capture.folder}: frame {frame.name} has no depth in the colours' pixels; "
@@ -95,17 +98,20 @@ class CaptureFrames(Sequence[PosedFrame]):
         poses = self._trajectory.world_from_camera
         pose = Similarity(poses.rotation[row], poses.translation[row], np.ones(()))
         usable = frame.usable if self._ignore is None else frame.usable & ~self._ignore
-        return PosedFrame(frame.name, frame.rgb, depth, usable, self._capture.camera.to_matrix(), pose)
+        return PosedFrame(frame.name, frame.rgb, depth, usable, self._capture.camera.to_matrix(), pose, confidence)
 
 
-def read_improved(folder: Path, name: str) -> Float[np.ndarray, "h w"]:
-    """The depth of a frame from ``folder/NAME.png``, which holds tenths of a millimetre.
+def read_improved(work: Path, name: str) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"] | None]:
+    """The depth of a frame from ``depth/NAME.png``, in tenths of a millimetre, and how sure it is, from
+    ``confidence/NAME.png``, where that is.
 
     Raises:
       CaptureError: it is not there, or cannot be read.
     """
     try:
-        return (read_depth(folder / f"{name}.png") * UNIT).astype(np.float32)
+        depth = (read_depth(work / "depth" / f"{name}.png") * UNIT).astype(np.float32)
+        path = work / "confidence" / f"{name}.png"
+        return depth, read_rgb(path)[..., 0].astype(np.float32) / 255 if path.is_file() else None
     except (ValueError, OSError) as error:
         raise CaptureError(str(error)) from None
 

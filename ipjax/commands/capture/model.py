@@ -106,11 +106,11 @@ def open_frames(arguments: argparse.Namespace, work: Path) -> Any:
     found = find_poses(work)
     if found is None:
         raise CaptureError(f"{work}: it has no poses.json; make it with ipjax capture pose")
-    folder, hidden = work / "depth", work / "ignore.png"
+    improved, hidden = work if (work / "depth").is_dir() else None, work / "ignore.png"
     ignore = read_mask(hidden) if hidden.is_file() else None
     if ignore is not None and ignore.shape != capture.size[::-1]:
         raise CaptureError(f"{hidden}: it is of another size than the frames, {capture.size[0]} × {capture.size[1]}")
-    frames = CaptureFrames(capture, read_trajectory(found), folder if folder.is_dir() else None, ignore)
+    frames = CaptureFrames(capture, read_trajectory(found), improved, ignore)
     # Every frame is looked at several times: short captures are kept in memory.
     pixels = len(frames) * capture.size[0] * capture.size[1]
     return list(frames) if pixels < _IN_MEMORY else frames
