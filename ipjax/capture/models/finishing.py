@@ -10,7 +10,7 @@ from ipjax.capture.models.surfaces import cut, number_pieces
 from ipjax.files.meshes.mesh import Mesh, corner_products, make_mesh, vertex_normals
 from ipjax.transforms import Similarity
 
-_LOOSE = 0.02  # of the surface: smaller pieces that hang nowhere are noise
+_LOOSE = 0.004  # of the surface: smaller pieces that hang nowhere are noise
 
 
 def drop_loose(mesh: Mesh, share: float = _LOOSE) -> Mesh:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 
 from ipjax.cameras import project, unproject
 from ipjax.capture.models.frames import PosedFrame
@@ -18,6 +19,9 @@ _SEED = 0.008  # metres about a clicked point that are surely the object's
 _NEAR = 0.02  # metres from the surface within which a click is on it
 _HIDDEN = 0.01  # metres behind what a frame measured, at which it does not see a point
 _FOOT = 0.01  # metres above the support: what is lower is where a thing stands
+_STANDS = 0.02  # metres above the support, below which a piece begins that is a thing by itself
+_APART = 0.03  # metres between pieces of one thing, where what is between them was not seen
+_BESIDE = 0.006  # … and between a thing and a small piece that belongs to it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,10 +30,10 @@ class Hint:
 
     name: str
     frame: str | None  # the frame's name; None = the first
-    x: float
-    y: float
-    right: float | None = None  # of a box, whose left upper corner is (x, y)
-    bottom: float | None = None
+    x: float | int
+    y: float | int
+    right: float | int | None = None  # of a box, whose left upper corner is (x, y)
+    bottom: float | int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,54 +70,90 @@ def separate(
     Raises:
       CaptureError: nothing stands there, or a hint is not on anything that does.
     """
-    above = support.heights(surface.vertices) > cut_at
-    inside = above & support.covers(surface.vertices)
-    keep = inside[surface.faces].all(1)
-    if not keep.any():
-        raise CaptureError("nothing stands on the support: no surface rises above the table")
-    rest = cut(surface, keep)
+    rest = _cut_off(surface, support, cut_at)
     piece = number_pieces(len(rest.vertices), rest.faces)
     share = np.linalg.norm(corner_products(rest.vertices, rest.faces), axis=-1) / 2
     area = np.bincount(piece[rest.faces[:, 0]], share, piece.max() + 1)
-    height = np.zeros(len(area))
-    np.maximum.at(height, piece, support.heights(rest.vertices))
-    candidates = np.flatnonzero((area > least_area) & (height > least_height))
-    if not len(candidates):
+    height = support.heights(rest.vertices)
+    top, foot = np.zeros(len(area)), np.full(len(area), np.inf)
+    np.maximum.at(top, piece, height)
+    np.minimum.at(foot, piece, height)
+    large = (area > least_area) & (top > least_height)
+    if not large.any():
         raise CaptureError("nothing that stands on the support is large enough to be an object")
-    seeds = [_place_hint(hint, frames, rest, np.isin(piece, candidates)) for hint in hints]
-    parts: list[tuple[float, Part]] = []
-    for number in candidates:
+    seeds = [_place_hint(hint, frames, rest, large[piece]) for hint in hints]
+    meant = np.unique(np.concatenate([piece[seed] for seed in seeds])) if seeds else np.zeros(0, int)
+    stands = large & (foot < _STANDS)
+    stands[meant] = True
+    if not stands.any():
+        stands = large
+    # Of every vertex the number of its object: hints first, then what is found without.
+    owner, count = np.full(len(rest.vertices), -1), len(hints)
+    for number in np.flatnonzero(stands):
         mine = np.flatnonzero(piece == number)
         mesh = cut(rest, piece[rest.faces[:, 0]] == number)  # keeps the vertices' order
         place = np.full(len(rest.vertices), -1)
         place[mine] = np.arange(len(mine))
-        here = [(k, place[seed][place[seed] >= 0]) for k, seed in enumerate(seeds)]
+        here = [(k, place[seed[piece[seed] == number]]) for k, seed in enumerate(seeds)]
         here = [(k, seed) for k, seed in here if len(seed) > 0.5 * len(seeds[k])]
         if len(here) > 1:
             label = split_by_seeds(make_affinity(mesh, seams), [seed for _, seed in here])
-        elif not here and alone:
-            stands = support.heights(mesh.vertices) < _FOOT
-            label = split_alone(make_affinity(mesh, seams), stands, least_area=least_area)
+            names = np.array([k for k, _ in here])
         else:
             label = np.zeros(len(mesh.vertices), int)
-        for value in range(label.max() + 1):
-            faces = (label[mesh.faces] == value).sum(1) >= 2
-            if not faces.any():
-                continue
-            hinted = value < len(here)
-            size = float(area[number] * faces.mean())
-            name = hints[here[value][0]].name if hinted else ""
-            order = -1e6 + here[value][0] if hinted else -size
-            parts.append((order, Part(name, cut(mesh, faces), hinted)))
-    parts.sort(key=lambda item: item[0])
+            if alone:
+                near = support.heights(mesh.vertices) < _FOOT
+                label = split_alone(make_affinity(mesh, seams), near, least_area=least_area)
+            names = count + np.arange(label.max() + 1)
+            count += len(names)
+            if here:
+                names[np.bincount(label[here[0][1]]).argmax()] = here[0][0]
+        owner[mine] = names[label]
+    owner = _attach(rest, piece, owner, np.where(large, _APART, _BESIDE))
+    faces_of = np.median(owner[rest.faces], axis=1).astype(int)  # of two corners or three
+    sizes = np.bincount(faces_of[faces_of >= 0], share[faces_of >= 0], count)
+    order = [*range(len(hints)), *(len(hints) + np.argsort(-sizes[len(hints) :], kind="stable"))]
     taken, found = {hint.name for hint in hints}, []
-    for _, part in parts:
-        if not part.name:
-            free = next(f"object_{k}" for k in range(1, len(parts) + len(taken) + 1) if f"object_{k}" not in taken)
-            taken.add(free)
-            part = dataclasses.replace(part, name=free)
-        found.append(part)
+    for number in order:
+        if not sizes[number] > 0:
+            continue
+        hinted = bool(number < len(hints))
+        name = hints[number].name if hinted else _name_freely(taken)
+        taken.add(name)
+        found.append(Part(name, cut(rest, faces_of == number), hinted))
     return found
+
+
+def _cut_off(surface: Mesh, support: Support, cut_at: float) -> Mesh:
+    """What of a surface is above the support and over what was seen of it."""
+    inside = (support.heights(surface.vertices) > cut_at) & support.covers(surface.vertices)
+    keep = inside[surface.faces].all(1)
+    if not keep.any():
+        raise CaptureError("nothing stands on the support: no surface rises above the table")
+    return cut(surface, keep)
+
+
+def _attach(
+    mesh: Mesh, piece: Int[np.ndarray, " n"], owner: Int[np.ndarray, " n"], within: Float[np.ndarray, " p"]
+) -> Int[np.ndarray, " n"]:
+    """The owners of pieces that hang nowhere: of what is nearest, if that is near enough for a piece of its kind."""
+    known = owner >= 0
+    loose = np.flatnonzero(~known)
+    if not len(loose) or not known.any():
+        return owner
+    distance, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[loose])
+    first = np.full(len(within), np.inf)
+    np.minimum.at(first, piece[loose], distance)
+    owner = owner.copy()
+    candidates = owner[np.flatnonzero(known)[nearest]]
+    for number in np.flatnonzero(first <= within):
+        mine = piece[loose] == number
+        owner[loose[mine]] = candidates[mine][distance[mine].argmin()]
+    return owner
+
+
+def _name_freely(taken: set[str]) -> str:
+    return next(f"object_{k}" for k in range(1, len(taken) + 2) if f"object_{k}" not in taken)
 
 
 def _place_hint(hint: Hint, frames: Sequence[PosedFrame], mesh: Mesh, allowed: np.ndarray) -> Int[np.ndarray, " k"]:
