@@ -15,6 +15,7 @@ from ipjax.rendering.render import render_each, render_frames
 from ipjax.transforms import Similarity
 
 _HIDES = 0.015  # metres by which what is measured must be nearer than the model to hide it
+_BATCH = 240  # images that are drawn at once
 _BEHIND = 0.02  # … or farther for the model not to be there
 
 
@@ -27,7 +28,6 @@ class FrameLabels:
     visible: Bool[np.ndarray, "n h w"]
     drawn: tuple[int, ...]  # pixels of the whole silhouette, those outside the image included
     box: tuple[tuple[int, int, int, int], ...]  # x, y, width, height of the whole silhouette; −1 where there is none
-    depth: Float[np.ndarray, "h w"]  # of all models together, metres; 0 = none
 
     @property
     def shares(self) -> Float[np.ndarray, " n"]:
@@ -55,6 +55,17 @@ def label_frames(
     """
     if not models:
         raise ValueError("there is nothing to label: no models")
+    batch = max(_BATCH // len(models), 1)
+    found = []
+    for start in range(0, len(frames), batch):
+        found += _label_batch(models, frames[start : start + batch], backend)
+        if progress is not None:
+            progress(len(found), len(frames))
+    return found
+
+
+def _label_batch(models: Sequence[ObjectModel], frames: Sequence[PosedFrame], backend: str) -> list[FrameLabels]:
+    """As `label_frames`, of frames few enough to be drawn at once."""
     first = frames[0]
     width, height = first.size
     camera_from_world = [frame.camera_from_world for frame in frames]
@@ -102,11 +113,8 @@ def label_frames(
                 visible,
                 tuple(int(v) for v in silhouettes.sum((1, 2))),
                 tuple(boxes),
-                drawn,
             )
         )
-        if progress is not None:
-            progress(number + 1, len(frames))
     return found
 
 
