@@ -71,10 +71,11 @@ def judge(state: State, equations: Equations, pairs: Pairs) -> Certainty:
 
 
 def measure_spread(equations: Equations, pairs: Pairs, count: int) -> float:
-    """By how much pairs pull apart at the solution more than independent residuals of unit variance would.
+    """By how much more than independent residuals of unit variance would the poses vary: a factor of their variance.
 
-    The median over pairs of gᵀ H⁻¹ g / 6, over what it is for six squares of unit normals, with the degrees of freedom
-    that the poses took given back.
+    That is how far pairs pull apart at the solution (the median over pairs of gᵀ H⁻¹ g, over what it is for six squares
+    of unit normals, with the degrees of freedom that the poses took given back), times the pairs of a frame, because
+    the frame's own errors are the same in all of them.
     """
     found = equations.pairs
     enough = found.near > 100
@@ -86,7 +87,8 @@ def measure_spread(equations: Equations, pairs: Pairs, count: int) -> float:
     part = slope / scale
     pulls = np.einsum("pi,pi->p", part, np.linalg.solve(even, part[..., None])[..., 0])
     free = max(1 - count / max(enough.sum() / 2, 1), 0.2)
-    return float(max(np.median(pulls) / 5.35 / free, np.mean(found.spread[enough]) ** 2))
+    pairwise = max(np.median(pulls) / 5.35 / free, np.mean(found.spread[enough]) ** 2)
+    return float(pairwise * max(len(pairs) / count, 1))
 
 
 def _eliminate(whole: Float[np.ndarray, "k k"], first: int) -> Float[np.ndarray, "j j"]:

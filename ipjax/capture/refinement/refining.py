@@ -13,7 +13,7 @@ import numpy as np
 from ipjax_kernels.trajectory import Gates
 from jaxtyping import Bool, Float, Int
 
-from ipjax.capture.poses.tracks import collect, triangulate
+from ipjax.capture.poses.tracks import collect, reproject, triangulate
 from ipjax.capture.records import Capture, CaptureError, Tracks, Trajectory
 from ipjax.capture.refinement.certainty import Certainty, judge
 from ipjax.capture.refinement.graph import Pairs, take
@@ -35,19 +35,19 @@ class Settings:
     alike: float = 0.7  # least cosine between the normals of points that are compared
     facing: float = 0.17  # least cosine between a normal and the direction to the camera
     partners: int = 8  # frames that each is compared with
-    temper: float = 30.0  # by how much fewer than its points the independent measurements of depth are
+    temper: float = 10.0  # by how much fewer than its points the independent measurements of depth are
     pull: tuple[float, float] = (3.0, 0.03)  # standard deviation of the given poses: degrees, metres
     offset: tuple[float, float] = (0.5, 0.005)  # of the factory's registration: degrees, metres
-    pixel_noise: float = 0.7  # of a recognised point, pixels
+    pixel_noise: float = 0.2  # of a recognised point, pixels, at least: it is measured
     contrast: float = 0.0  # noise of flattened brightness; 0 = colours are not compared
     # Of each stage: the level (0 = coarsest), the kernel's width in multiples of the noise of depth, the same of
     # recognised points (0 = they do not count yet), and steps.
     stages: tuple[tuple[int, float, float, int], ...] = (
         (0, 40.0, 0.0, 8),
         (0, 20.0, 0.0, 6),
-        (1, 10.0, 30.0, 6),
-        (1, 5.0, 10.0, 5),
-        (2, 4.0, 5.0, 5),
+        (1, 10.0, 4.0, 6),
+        (1, 5.0, 4.0, 5),
+        (2, 4.0, 3.0, 5),
         (2, 2.0, 3.0, 6),
     )
 
@@ -197,16 +197,26 @@ class _Solver:
         return state, equations, pairs
 
     def _triangulate(self, state: State) -> State:
-        """Points of the tracks as these poses have them; those that rays do not tell are left out of the problem."""
+        """Points of the tracks as these poses have them; those that rays do not tell are left out of the problem.
+
+        What the points are off by the median is what their pixels' noise is taken for.
+        """
         tracks = self.problem.tracks
         assert tracks is not None
         points, told = triangulate(
             tracks, state.world_from_camera, self.problem.K, np.ones(len(state.world_from_camera.scale), bool)
         )
-        if not told.all():
-            kept = told[tracks.track]
-            tracks = collect(tracks.frame[kept], tracks.track[kept], tracks.pixel[kept], tracks.depth[kept])
-            self.problem = dataclasses.replace(self.problem, tracks=tracks if tracks.count else None)
+        if not told.any():
+            self.problem = dataclasses.replace(self.problem, tracks=None)
+            return state
+        kept = told[tracks.track]
+        tracks = collect(tracks.frame[kept], tracks.track[kept], tracks.pixel[kept], tracks.depth[kept])
+        off, _ = reproject(tracks, points[told], state.world_from_camera, self.problem.K)
+        # By the median of the length of two normal errors; of a track of two frames a half of them is fitted away.
+        noise = float(np.median(off)) / 1.18 * np.sqrt(len(off) / max(len(off) - 1.5 * tracks.count, 1))
+        self.problem = dataclasses.replace(
+            self.problem, tracks=tracks, pixel_noise=max(noise, self.settings.pixel_noise)
+        )
         return dataclasses.replace(state, points=points[told])
 
     def measure(self, state: State, pairs: Pairs) -> Equations:

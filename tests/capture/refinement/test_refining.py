@@ -1,14 +1,12 @@
 """Refined poses: they converge from afar, know how well they are known, and say what the scene does not tell."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from builders.ray_cast import K, cast, go_around
 
 from ipjax.capture.records import CaptureError, Tracks, Trajectory
 from ipjax.capture.refinement.certainty import off_by
-from ipjax.capture.refinement.refining import Settings, describe, refine_frames
+from ipjax.capture.refinement.refining import describe, refine_frames
 from ipjax.records import Camera
 from ipjax.transforms import Similarity
 
@@ -90,8 +88,7 @@ def test_points_tell_what_the_registration_of_depth_is_off_by(scene):
     order = np.lexsort((frame, track))
     tracks = Tracks(np.array(frame)[order], np.array(track)[order], np.concatenate(pixel)[order],
                     np.zeros(len(frame)), len(points))  # fmt: skip
-    settings = dataclasses.replace(Settings(), pixel_noise=0.2)
-    found = refine_frames(depths, None, CAMERA, given(perturb(cameras, 0.2, 3)), tracks, settings=settings)
+    found = refine_frames(depths, None, CAMERA, given(perturb(cameras, 0.2, 3)), tracks)
     assert found.offset_told
     left = (found.camera_from_depth.inverse() @ off).log()
     assert np.abs(left[3:6]).max() < 0.0012 and np.rad2deg(np.abs(left[:3]).max()) < 0.06
