@@ -150,5 +150,5 @@ def off_by(found: Similarity[np.ndarray], true: Similarity[np.ndarray]) -> Float
         moved = world @ found
         error = (true.inverse() @ moved).log()[:, :6]
         step = np.linalg.lstsq(gauge(moved) * weight[:, None], error.reshape(-1) * weight, rcond=None)[0]
-        world = Similarity.exp(-step) @ world
+        world = Similarity[np.ndarray].exp(-step) @ world
     return error

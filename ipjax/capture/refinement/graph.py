@@ -76,7 +76,7 @@ def gauge(world_from_camera: Similarity[np.ndarray]) -> Float[np.ndarray, "k 6"]
 
 def move(world_from_camera: Similarity[np.ndarray], step: Float[np.ndarray, " k"]) -> Similarity[np.ndarray]:
     """Every camera moved along its own axes."""
-    return world_from_camera @ Similarity.exp(step.reshape(-1, 6))
+    return world_from_camera @ Similarity[np.ndarray].exp(step.reshape(-1, 6))
 
 
 def as_doubles(equations: PairEquations) -> PairEquations:

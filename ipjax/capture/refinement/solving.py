@@ -156,5 +156,5 @@ def _step(state: State, equations: Equations, motion: Float[np.ndarray, " k"], c
         return dataclasses.replace(state, world_from_camera=poses)
     shift = equations.tracks.offset - equations.tracks.points_from_cameras @ motion[: 6 * count]
     points = state.points + np.clip(shift.reshape(-1, 3), -LONGEST, LONGEST)
-    offset = state.camera_from_depth @ Similarity.exp(motion[6 * count :])
+    offset = state.camera_from_depth @ Similarity[np.ndarray].exp(motion[6 * count :])
     return State(poses, offset, points)
