@@ -62,7 +62,7 @@ class PairEquations(NamedTuple):
     slope: Float[Array, "p 6"]
     shared: Float[Array, "p 6 6"]  # the Hessian of depths with one normal from either frame: free of the normals' noise
     loss: Float[Array, "p"]  # sum over its points of width² ρ, ρ in [0, 1]
-    count: Float[Array, "p"]  # points that were compared: inside of the target's image, where it has a depth
+    compared: Float[Array, "p"]  # number of points that were: inside of the target's image, where it has a depth
     near: Float[Array, "p"]  # of these, those whose residual is below the kernel's width
     spread: Float[Array, "p"]  # mean absolute residual of the near ones, in multiples of its noise
 

@@ -78,7 +78,7 @@ def test_equations_are_those_of_the_twin(small, colours):
             places[one], chosen[one, :, 1:4], chosen[one, :, 4], there[one], values[other], SMALL_FOCAL, SMALL_CENTRE,
             rotation[index], translation[index], single, colours,
         )  # fmt: skip
-        assert want["count"] > 40 and want["near"] > 20
+        assert want["compared"] > 40 and want["near"] > 20
         for name, value in want.items():
             got = np.asarray(getattr(found, name))[index]
             np.testing.assert_allclose(got, value, rtol=2e-3, atol=2e-3 * np.abs(value).max())

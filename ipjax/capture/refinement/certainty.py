@@ -46,28 +46,37 @@ def judge(state: State, equations: Equations, pairs: Pairs) -> Certainty:
     told = (vectors * np.maximum(values, _UNTOLD**-2)) @ vectors.T
     share = np.zeros(count)
     with np.errstate(invalid="ignore", divide="ignore"):
-        agreeing = np.where(found.count > 0, found.near / np.maximum(found.count, 1), 0)
-    np.maximum.at(share, pairs.source, np.where(found.count > 100, agreeing, 0))
+        agreeing = np.where(found.compared > 0, found.near / np.maximum(found.compared, 1), 0)
+    np.maximum.at(share, pairs.source, np.where(found.compared > 100, agreeing, 0))
     motions = gauge(state.world_from_camera) / unit[:, None]
     motions /= np.linalg.norm(motions, axis=0)
     reference = np.ones(count, bool)
-    for _ in range(4):
-        covariance = _relative_to(told, motions, reference)
-        blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
-        worst = np.sqrt(np.maximum(np.linalg.eigvalsh(blocks)[:, -1], 0))
-        sure = (worst < 1) & (share > LEAST_SHARE)
+    blocks, sure = _judge_against(reference, told, motions, share)
+    for _ in range(3):
         # Where none is, those that are sure relative to the best known one; that itself is no more than where to begin.
-        fresh = sure if sure.any() else np.arange(count) == np.argmin(worst)
+        fresh = sure if sure.any() else np.arange(count) == np.argmin(np.linalg.eigvalsh(blocks)[:, -1])
         if (fresh == reference).all():
             break
         reference = fresh
+        blocks, sure = _judge_against(reference, told, motions, share)
     if sure.sum() < 2:  # a frame is sure relative to others
+        blocks, _ = _judge_against(np.ones(count, bool), told, motions, share)
         sure = np.zeros(count, bool)
-        covariance = _relative_to(told, motions, np.ones(count, bool))
-        blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
     remarks = tuple("" if sure[k] else _describe(blocks[k], share[k]) for k in range(count))
     scale = unit[:6]
     return Certainty(blocks * scale[:, None] * scale, sure, remarks, spread)
+
+
+def _judge_against(
+    reference: Bool[np.ndarray, " n"],
+    told: Float[np.ndarray, "k k"],
+    motions: Float[np.ndarray, "k 6"],
+    share: Float[np.ndarray, " n"],
+) -> tuple[Float[np.ndarray, "n 6 6"], Bool[np.ndarray, " n"]]:
+    """Covariances where the reference frames together stay, in multiples of the limits; and which keep to these."""
+    covariance = _relative_to(told, motions, reference)
+    blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(reference))])
+    return blocks, (np.linalg.eigvalsh(blocks)[:, -1] < 1) & (share > LEAST_SHARE)
 
 
 def measure_spread(equations: Equations, pairs: Pairs, count: int) -> float:

@@ -5,6 +5,7 @@ and memory grows with n², time with n³; 1000 frames would take a minute a step
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from ipjax_kernels.trajectory import PairEquations
@@ -22,6 +23,27 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.source)
+
+
+@dataclasses.dataclass(frozen=True)
+class PairSums:
+    """`ipjax_kernels.trajectory.PairEquations` in NumPy's doubles."""
+
+    hessian: Float[np.ndarray, "p 6 6"]
+    slope: Float[np.ndarray, "p 6"]
+    shared: Float[np.ndarray, "p 6 6"]
+    loss: Float[np.ndarray, " p"]
+    compared: Float[np.ndarray, " p"]
+    near: Float[np.ndarray, " p"]
+    spread: Float[np.ndarray, " p"]
+
+    @staticmethod
+    def join(parts: Sequence[PairEquations], count: int) -> "PairSums":
+        """Of several calls of the kernel, one after the other, the first ``count`` pairs."""
+        whole = [
+            np.concatenate([np.asarray(part, np.float64) for part in each])[:count] for each in zip(*parts, strict=True)
+        ]
+        return PairSums(*whole)
 
 
 def relate(world_from_camera: Similarity[np.ndarray], pairs: Pairs) -> Similarity[np.ndarray]:
@@ -77,8 +99,3 @@ def gauge(world_from_camera: Similarity[np.ndarray]) -> Float[np.ndarray, "k 6"]
 def move(world_from_camera: Similarity[np.ndarray], step: Float[np.ndarray, " k"]) -> Similarity[np.ndarray]:
     """Every camera moved along its own axes."""
     return world_from_camera @ Similarity[np.ndarray].exp(step.reshape(-1, 6))
-
-
-def as_doubles(equations: PairEquations) -> PairEquations:
-    """The same in NumPy's doubles."""
-    return PairEquations(*(np.asarray(part, np.float64) for part in equations))  # type: ignore[arg-type]

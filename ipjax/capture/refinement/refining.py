@@ -269,7 +269,7 @@ def _report(trajectory, known, state: State, equations, before, pairs, certainty
     sure[known] = certainty.sure
     for index, text in zip(known, certainty.remarks, strict=True):
         remarks[index] = text
-    share = lambda found: found.pairs.near / np.maximum(found.pairs.count, 1)
+    share = lambda found: found.pairs.near / np.maximum(found.pairs.compared, 1)
     refined = Trajectory(
         trajectory.names,
         Similarity(rotation, translation, np.ones(count)),

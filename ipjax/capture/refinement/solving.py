@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
-from ipjax_kernels.trajectory import Gates, PairEquations, compare_pairs
+from ipjax_kernels.trajectory import Gates, compare_pairs
 from jaxtyping import Float
 
 from ipjax.capture.records import Tracks
-from ipjax.capture.refinement.graph import Pairs, as_doubles, assemble, lever, move, relate
+from ipjax.capture.refinement.graph import Pairs, PairSums, assemble, lever, move, relate
 from ipjax.capture.refinement.surfaces import Level
 from ipjax.capture.refinement.tracked import TrackEquations, compare_tracks
 from ipjax.transforms import Similarity
@@ -49,7 +49,7 @@ class Problem:
 class Equations:
     """The normal equations of a state: the cameras' motions, then the offset's, which has rows only with tracks."""
 
-    pairs: PairEquations
+    pairs: PairSums
     relative: Similarity[np.ndarray]  # target_from_source of the depth cameras
     tracks: TrackEquations | None
 
@@ -74,9 +74,7 @@ def evaluate(
     return Equations(found, relative, seen)
 
 
-def _compare(
-    level: Level, pairs: Pairs, relative: Similarity[np.ndarray], gates: Gates, colours: bool
-) -> PairEquations:
+def _compare(level: Level, pairs: Pairs, relative: Similarity[np.ndarray], gates: Gates, colours: bool) -> PairSums:
     """So many pairs at a time that one compilation serves any number of them."""
     parts = []
     for start in range(0, max(len(pairs), 1), TOGETHER):
@@ -90,8 +88,8 @@ def _compare(
                 (relative.translation, jnp.float32),
             )
         ]
-        parts.append(as_doubles(compare_pairs(level.samples, level.images, *numbers, gates, colours=colours)))
-    return PairEquations(*(np.concatenate(each)[: len(pairs)] for each in zip(*parts, strict=True)))
+        parts.append(compare_pairs(level.samples, level.images, *numbers, gates, colours=colours))
+    return PairSums.join(parts, len(pairs))
 
 
 def join(

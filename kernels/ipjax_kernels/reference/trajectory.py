@@ -97,4 +97,4 @@ def compare_pair(places, normals, brightness, there, image, focal, centre, rotat
             for name in ("hessian", "shared"):
                 found[name] += weight * np.outer(lever, lever)
             found["slope"] += weight * unlike * lever
-    return found | {"count": count, "near": len(errors), "spread": np.mean(errors) if errors else 0.0}
+    return found | {"compared": count, "near": len(errors), "spread": np.mean(errors) if errors else 0.0}
