@@ -84,7 +84,7 @@ def draw_agreement(
       notes: lines that are written below.
     """
     K = camera.to_matrix()
-    known = [int(k) for k in np.flatnonzero(after.registered) if depths[k] is not None]
+    known = [k for k in np.flatnonzero(after.registered).tolist() if depths[k] is not None]
     upright = find_upright(after)
     clouds = {k: lift(np.asarray(depths[k]), K, _POINTS) for k in known}
     place = lambda trajectory, k: (
