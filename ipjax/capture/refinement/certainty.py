@@ -128,6 +128,8 @@ def _describe(block: Float[np.ndarray, "6 6"], share: float) -> str:
     """What is not determined of a frame, in words; ``block`` in multiples of `TURN` and `SHIFT`."""
     said: list[str] = []
     values, vectors = np.linalg.eigh(block)
+    if values[0] > (0.1 * _UNTOLD) ** 2:
+        return "not determined: nothing ties it to the other frames"
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
         size = np.sqrt(max(value, 0))
         if size < 1:
