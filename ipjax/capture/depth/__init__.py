@@ -1,0 +1,1 @@
+"""Depth of a capture, in the pixels of its colours: estimated, aligned, fused."""
