@@ -50,7 +50,7 @@ class _Surface:
 
 @dataclasses.dataclass(frozen=True)
 class _Problem:
-    points: Sequence[tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]]
+    points: Sequence[tuple[np.ndarray, np.ndarray]]  # of each frame: points in the colour camera, weights
     surfaces: Sequence[_Surface]
     poses: Sequence[Similarity[np.ndarray]]
     pairs: Sequence[tuple[int, int]]
@@ -98,6 +98,8 @@ def solve_rig(
         apart = np.array([difference(other, rig) for other in left])
         jackknife = np.sqrt((len(folds) - 1) / len(folds) * np.sum((apart - apart.mean(0)) ** 2, axis=0))
         deviation = np.maximum(deviation, jackknife)
+    elif leave_out:
+        deviation = np.maximum(deviation, problem.prior)  # from so few frames nothing tells how wrong their poses are
     agreement, spread = _judge(problem, rig)
     return decide(rig, start, told, deviation, agreement, spread, _judge(problem, start)[1])
 

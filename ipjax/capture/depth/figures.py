@@ -1,4 +1,4 @@
-"""How good aligned depth is, told without the truth: against stereo, against neighbours, against edges of the colours."""
+"""How good aligned depth is, told without the truth: by stereo, by neighbouring frames, by edges of the colours."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy import ndimage
 
 from ipjax.capture.depth.rigs import Rig
-from ipjax.capture.depth.stereo import Views, choose_neighbours, sweep_view
+from ipjax.capture.depth.stereo import Views, choose_neighbours
 
 _NEAR = 0.04  # of the depth: two that differ by more are of different surfaces
 
@@ -49,7 +49,7 @@ def measure_modes(
     rows: dict[str, list[tuple[float, ...]]] = {name: [] for name in ways}
     for done, index in enumerate(chosen):
         place = views.indices.index(index)
-        stereo = sweep_view(views, place)
+        stereo = maker.stereo(place)
         near = choose_neighbours(views, place)[0]
         for name, way in ways.items():
             depth = way(index)

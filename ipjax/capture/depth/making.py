@@ -27,7 +27,7 @@ from ipjax.capture.depth.paper import align_as_paper, lay_over
 from ipjax.capture.depth.pictures import draw_depths
 from ipjax.capture.depth.rigs import Rig, SolvedRig, find_start, leave
 from ipjax.capture.depth.solving import solve_depth_camera, spread
-from ipjax.capture.depth.stereo import Views, choose_neighbours, shrink_views, sweep_view
+from ipjax.capture.depth.stereo import StereoDepth, Views, choose_neighbours, shrink_views, sweep_view
 from ipjax.capture.depth.warping import lift_raw, warp
 from ipjax.capture.records import Capture, CaptureError, CaptureFrame, Trajectory
 from ipjax.files.storage.parsing import read_json
@@ -37,7 +37,7 @@ MODES = ("solve", "paper", "factory")
 UNIT = 0.0001  # metres per number of the depth images
 VERSION = 1
 _KEPT = 16  # frames that are kept in memory
-_MEASURED = 4  # frames on which the modes are compared
+_MEASURED = 2  # frames on which the modes are compared
 _SCORE = 0.7  # correlation of the stereo that the paper's mode takes
 
 Told = Callable[[str, int, int], None]
@@ -64,12 +64,16 @@ class DepthMaker:
         self.K, self.size = np.asarray(capture.camera.to_matrix(), np.float64), capture.size
         self.read = functools.lru_cache(_KEPT)(capture.read_frame)
         self.views: Views | None = None
+        self.stereo = functools.lru_cache(_KEPT)(self._sweep)
 
     def shrink(self, progress: Callable[[int, int], None] | None = None) -> Views:
         """The views for the stereo, read once."""
         if self.views is None:
             self.views = shrink_views(self.capture, self.trajectory, read=self.read, progress=progress)
         return self.views
+
+    def _sweep(self, place: int) -> StereoDepth:
+        return sweep_view(self.shrink(), place)
 
     def raw(self, index: int) -> Float[np.ndarray, "hd wd"]:
         """A frame's depth as its depth camera saw it, or what was registered of it, without what moves along."""
@@ -91,7 +95,12 @@ class DepthMaker:
             return leave(self.start, "fewer than three frames have poses: the depth camera's rig is left as it was")
         views = self.shrink()
         return solve_depth_camera(
-            views, lambda place: self.raw(views.indices[place]), self.start, told=self.told, progress=progress
+            views,
+            lambda place: self.raw(views.indices[place]),
+            self.start,
+            told=self.told,
+            look=self.stereo,
+            progress=progress,
         )
 
     def by_factory(self, index: int) -> Float[np.ndarray, "h w"]:
@@ -120,7 +129,7 @@ class DepthMaker:
         views = self.shrink()
         if not self.trajectory.registered[index]:
             return np.zeros(self.size[::-1], np.float32)
-        found = sweep_view(views, views.indices.index(index))
+        found = self.stereo(views.indices.index(index))
         captured = lay_over(self.raw(index), self.start.depth_camera, views.K, views.size)
         small = align_as_paper(captured, np.where(found.score > _SCORE, found.depth, 0), views.K).depth
         return np.asarray(Image.fromarray(small.astype(np.float32)).resize(self.size, Image.Resampling.NEAREST))
@@ -151,8 +160,8 @@ def make_depth(
         raise CaptureError(f"no mode is called {mode!r}; one of {', '.join(MODES)}")
     if trajectory.names != capture.names:
         raise CaptureError(
-            f"the poses are of {len(trajectory)} frames, not of the {len(capture)} of {capture.folder}: give those that "
-            "ipjax capture pose found in this capture, with the same --every"
+            f"the poses are of {len(trajectory)} frames, not of the {len(capture)} of {capture.folder}: give those "
+            "that ipjax capture pose found in this capture, with the same --every"
         )
     work, tell = Path(work), progress or (lambda what, done, total: None)
     maker = DepthMaker(capture, trajectory)

@@ -14,7 +14,7 @@ def draw_depths(
     factory: Float[np.ndarray, "h w"],
     made: Float[np.ndarray, "h w"],
     confidence: Float[np.ndarray, "h w"],
-) -> UInt8[np.ndarray, "2h 2w 3"]:
+) -> UInt8[np.ndarray, "hp wp 3"]:
     """Colours with the jumps of both depths (the factory's red, this one green), both depths, and the confidence."""
     import cv2
 
@@ -29,7 +29,7 @@ def draw_depths(
     for panel, text in zip(panels, words, strict=True):
         scale = max(rgb.shape[1] / 1200, 0.3)
         place = (8, round(34 * scale) + 4)
-        cv2.putText(panel, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 3, cv2.LINE_AA)
+        cv2.putText(panel, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), 2, cv2.LINE_AA)
         cv2.putText(panel, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 1, cv2.LINE_AA)
     return np.concatenate([np.concatenate(panels[:2], axis=1), np.concatenate(panels[2:], axis=1)], axis=0)
 

@@ -19,6 +19,7 @@ def solve_depth_camera(
     start: Rig,
     *,
     told: bool,
+    look: Callable[[int], StereoDepth] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> SolvedRig:
     """Solve the depth camera in two rounds: by stereo that knows nothing of it, then by stereo along its raw depth.
@@ -29,14 +30,16 @@ def solve_depth_camera(
     Args:
       read_raw: from a place among the views to its raw depth, metres, 0 where unknown or where the gripper is.
       start, told: as `solve_rig` takes them.
+      look: from a place among the views to its stereo through all of the depth, if that is kept; by default it is made.
     """
     if len(views.indices) < 3:
         return leave(start, "fewer than three frames have poses: the depth camera's rig is left as it was")
     first, second = (spread(len(views.indices), count) for count in (FIRST, SECOND))
     total = len(first) + len(second)
+    look = look or (lambda place: sweep_view(views, place))
     evidence = []
     for done, place in enumerate(first):
-        evidence.append(_gather(views, place, read_raw(place), sweep_view(views, place)))
+        evidence.append(_gather(views, place, read_raw(place), look(place)))
         if progress is not None:
             progress(done + 1, total)
     rough = solve_rig(evidence, start, told=told, leave_out=False)

@@ -167,7 +167,7 @@ def sweep_view(
     found = Sweep(*(np.asarray(x, np.float64) for x in jax.device_get(found)))
     inverse = np.where(start > 0, found.inverse, 0) if base is not None else found.inverse
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-6), 0)
-    # Of a peak 1 − ½ c d², whose height is uncertain by (1 − score) of a window's pixels, the place is uncertain by this.
+    # Of a peak 1 − ½ c d² whose height is uncertain by 1 − score over a window, the place is uncertain by this.
     planes = np.sqrt(np.maximum(1 - found.score, 0.01) / (np.maximum(found.curvature, 1e-6) * (2 * radius + 1)))
     deviation = np.where(depth > 0, planes * (offsets[1] - offsets[0]) * depth**2, np.inf)
     sure = (found.score > _LEAST_SCORE) & (depth > 0) & views.usable[place]

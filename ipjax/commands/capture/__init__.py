@@ -2,15 +2,16 @@
 
 from typing import Any
 
-from ipjax.commands.capture import check, label, model, pose, refine
+from ipjax.commands.capture import check, depth, label, model, pose, refine
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (check, pose, refine, model, label)  # as --help lists them
+STEPS = (check, pose, refine, depth, model, label)  # as --help lists them
 EXAMPLES = """\
 examples:
   ipjax capture check table/ -o check.html     what it has, what is missing, and what looks wrong
   ipjax capture pose table/ -o work/           where the camera stood, frame by frame: work/poses.json
   ipjax capture refine table/ -o work/         the same, made exact: work/refined.json
+  ipjax capture depth table/ -o work/          depth in the pixels of the colours, without holes: work/depth/
   ipjax capture model table/ -o work/          models of what stands on the table: work/models/
   ipjax capture label table/ -o work/          masks, boxes and poses of every frame, in BOP's layout: work/dataset/
 

@@ -33,12 +33,12 @@ def fuse_depth(
     """
     count = len(stack)
     present = stack > 0
-    near = lambda centre: jnp.abs(stack - centre) < jnp.maximum(gate * centre, floor)
+    near = lambda centre: jnp.abs(stack - centre[None]) < jnp.maximum(gate * centre, floor)[None]
     own = stack[0]
     centre, most = jnp.zeros_like(own), jnp.zeros_like(own)
     for place in range(1, count):
         candidate = stack[place]
-        votes = jnp.sum((near(candidate) & present)[1:], axis=0) * present[place]
+        votes = jnp.where(present[place], jnp.sum((near(candidate) & present)[1:], axis=0, dtype=own.dtype), 0)
         better = (votes > most) | ((votes == most) & (candidate < centre) & present[place])
         centre, most = jnp.where(better, candidate, centre), jnp.where(better, votes, most)
     alone = jnp.sum((near(own) & present)[1:], axis=0) == 0

@@ -29,13 +29,13 @@ def propagate_offsets(
     reach: float | Float[Array, ""],
     unit: float | Float[Array, ""],
     angle: float | Float[Array, ""] = 0.5,
-    iterations: int = 10,
+    iterations: int = 8,
 ) -> tuple[Int[Array, "h w 2"], Float[Array, "h w"]]:
     """The offset (x, y) from each pixel of the estimated depth to the pixel of the captured one that has its patch.
 
-    A patch is 3 × 3 pixels, two apart. Its cost is the mean, over its pixels whose estimated depth is known, of half the
-    depth difference in ``unit`` and half the normals' 1 − cosine in ``angle``, each at most 1; 1 where the captured one
-    is unknown. Pixels without any estimated depth keep offset 0 at cost 1.
+    A patch is 3 × 3 pixels, two apart. Its cost is the mean, over its pixels whose estimated depth is known, of half
+    the depth difference in ``unit`` and half the normals' 1 − cosine in ``angle``, each at most 1; 1 where the captured
+    one is unknown. Pixels without any estimated depth keep offset 0 at cost 1.
 
     Args:
       estimated, captured: along z, 0 = unknown.
@@ -70,9 +70,7 @@ def propagate_offsets(
     def iterate(index, state):
         mine = ((rows + columns + index) % 2 == 0) & (count > 0)
         moves = jnp.asarray(_FROM)
-        state = lax.fori_loop(
-            0, len(_FROM), lambda k, state: try_out(state, _roll(state[0], moves[k]), mine), state
-        )
+        state = lax.fori_loop(0, len(_FROM), lambda k, state: try_out(state, _roll(state[0], moves[k]), mine), state)
         radius = jnp.maximum(reach * 0.6**index, 1.0)
 
         def wander(k, state):

@@ -48,8 +48,8 @@ def sweep(
       offsets: rising by equal steps, 1 / depth. Where ``base + offset`` is not positive nothing is compared.
       valid: which neighbours are there.
       radius: of the windows: 2 · radius + 1 pixels.
-      keep: a plane's score is the mean of this many best neighbours', so that a surface may be hidden from the others; a
-        neighbour that does not see it counts −1.
+      keep: a plane's score is the mean of this many best neighbours', so that a surface may be hidden from the others;
+        a neighbour that does not see it counts −1.
 
     The planes follow one another; temporary memory: two images a plane for the scores, a few images beside.
     """
@@ -113,7 +113,7 @@ def _mean_of_best(scores, keep, there):
     for score in scores:
         for place in range(keep):
             best[place], score = jnp.maximum(best[place], score), jnp.minimum(best[place], score)
-    counted = jnp.clip(there, 1, keep)
+    counted = jnp.clip(there, 1, keep).astype(scores.dtype)
     return sum(jnp.where(place < counted, image, 0) for place, image in enumerate(best)) / counted
 
 

@@ -7,6 +7,7 @@ from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 _SLACK = 1e-3  # of a cell: neighbouring cells both take what lies on the line between them
@@ -50,11 +51,13 @@ def warp_depth(
     size = jnp.broadcast_to(jnp.asarray(size, points.dtype), 2)
     covered = jnp.full(height * width, far)
     first_x, first_y = jnp.ceil(x - size[0] / 2), jnp.ceil(y - size[1] / 2)
-    for down in range(reach):
-        for right in range(reach):
-            column, row = first_x + right, first_y + down
-            inside = there & (column <= x + size[0] / 2) & (row <= y + size[1] / 2)
-            covered = _put(covered, row, column, z, inside, height, width)
+
+    def cover(step, covered):
+        column, row = first_x + step % reach, first_y + step // reach
+        inside = there & (column <= x + size[0] / 2) & (row <= y + size[1] / 2)
+        return _put(covered, row, column, z, inside, height, width)
+
+    covered = lax.fori_loop(0, reach**2, cover, jnp.full(height * width, far))
     wins = ~jnp.isfinite(surface) | (covered < surface * (1 - jump))
     image = jnp.where(wins, covered, surface).reshape(height, width)
     return jnp.where(jnp.isfinite(image), image, 0)
@@ -74,12 +77,13 @@ def _draw(surface, corners, height, width, jump, reach):
     ]
     least = lambda axis: reduce(jnp.minimum, [jnp.where(corner[3], corner[axis], 1e6) for corner in corners])
     first_x, first_y = jnp.ceil(least(0) - _SLACK), jnp.ceil(least(1) - _SLACK)
-    for down in range(reach):
-        for right in range(reach):
-            column, row = first_x + right, first_y + down
-            (depth, inside), (other, beside) = (look(column, row) for look in triangles)
-            surface = _put(surface, row, column, jnp.where(inside, depth, other), inside | beside, height, width)
-    return surface
+
+    def draw(step, surface):
+        column, row = first_x + step % reach, first_y + step // reach
+        (depth, inside), (other, beside) = (look(column, row) for look in triangles)
+        return _put(surface, row, column, jnp.where(inside, depth, other), inside | beside, height, width)
+
+    return lax.fori_loop(0, reach**2, draw, surface)
 
 
 def _triangle(first, second, third, jump):
