@@ -18,12 +18,12 @@ from ipjax.capture.depth.rigs import TOLD, UNTOLD, Rig, SolvedRig, decide, diffe
 from ipjax.transforms import Similarity
 
 WIDTHS = (0.04, 0.02, 0.01, 0.006, 0.004)  # of the robust kernel, metres, from coarse to fine
-_STEPS = 6  # of Gauss-Newton at each width
+_STEPS = 4  # of Gauss-Newton at each width
 # Errors of a pose are common to all points of a frame, or of a pair: however many there are, they count as so many.
 _COUNT_STEREO, _COUNT_RAW = 30.0, 30.0
 _FINEST = 0.0005  # metres: no residual is taken to be more exact
 _FEWEST = 500  # points of the stereo
-_SAMPLES = 1500  # points of a raw image that are carried into others
+_SAMPLES = 800  # points of a raw image that are carried into others
 _ANGLES = (20, 45, 75, 110)  # degrees between the views of a pair: the nearest to each of these
 
 
@@ -93,7 +93,7 @@ def solve_rig(
     deviation = np.sqrt(np.diag(np.linalg.inv(hessian)))
     if leave_out and len(evidence) >= 4:
         # Errors of a frame's pose are common to all its points, which the curvature does not know: leave frames out.
-        folds = np.array_split(np.arange(len(evidence)), min(len(evidence), 6))
+        folds = np.array_split(np.arange(len(evidence)), min(len(evidence), 4))
         left = [_descend(problem.without({*map(int, fold)}), rig, WIDTHS[-1:])[0] for fold in folds]
         apart = np.array([difference(other, rig) for other in left])
         jackknife = np.sqrt((len(folds) - 1) / len(folds) * np.sum((apart - apart.mean(0)) ** 2, axis=0))
