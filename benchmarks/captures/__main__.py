@@ -3,6 +3,7 @@
     python -m benchmarks.captures poses --seeds 101 102 … [--factory 0]    made captures of 24 views
     python -m benchmarks.captures poses --real ../shared/data/captures     those whose poses are known
     python -m benchmarks.captures refine --seeds 201 202 … [--ways global]  the same, and --real
+    python -m benchmarks.captures depth --seeds 301 302 …                  depth, with poses a millimetre off; and --real
     python -m benchmarks.captures page                                     benchmarks/results/captures.md
 
 A line of build/captures.jsonl for each capture and way; lines that are there are not made again.
@@ -11,12 +12,12 @@ A line of build/captures.jsonl for each capture and way; lines that are there ar
 import argparse
 from pathlib import Path
 
-from benchmarks.captures import poses, refinement
+from benchmarks.captures import depth, poses, refinement
 from benchmarks.measure import commit, describe_device
 from ipjax.files.storage.parsing import parse_json
 from ipjax.files.storage.writing import append_json, read_lines, write_text
 
-STEPS = {"poses": poses, "refine": refinement}
+STEPS = {"poses": poses, "refine": refinement, "depth": depth}
 PAGE = Path("benchmarks/results/captures.md")
 
 
