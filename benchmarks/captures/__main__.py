@@ -3,7 +3,7 @@
     python -m benchmarks.captures poses --seeds 101 102 … [--factory 0]    made captures of 24 views
     python -m benchmarks.captures poses --real ../shared/data/captures     those whose poses are known
     python -m benchmarks.captures refine --seeds 201 202 … [--ways global]  the same, and --real
-    python -m benchmarks.captures depth --seeds 301 302 …                  depth, with poses a millimetre off; and --real
+    python -m benchmarks.captures depth --seeds 301 302 …                  depth, by disturbed poses; and --real
     python -m benchmarks.captures page                                     benchmarks/results/captures.md
 
 A line of build/captures.jsonl for each capture and way; lines that are there are not made again.

@@ -1,4 +1,4 @@
-"""Depth in the pixels of the colours: how exact, on objects and at their borders, how full, by which way, at what cost."""
+"""Depth in the pixels of the colours: how exact, on objects and their borders, how full, by which way, at what cost."""
 
 import dataclasses
 import time
@@ -149,9 +149,8 @@ def _measure_real(folder: Path, done: set[tuple]) -> Iterator[dict]:
             continue
         capture = open_capture(folder / name, camera="tum-fr3" if name == "cabinet" else None)
         moving, read = find_moving(capture), capture.read_frame
-        hide = lambda frame, moving: dataclasses.replace(frame, usable=frame.usable & ~moving)
         capture = dataclasses.replace(
-            capture, read_frame=lambda index, read=read, moving=moving: hide(read(index), moving)
+            capture, read_frame=lambda index, read=read, moving=moving: _hide(read(index), moving)
         )
         poses = Trajectory(capture.names, capture.world_from_camera, np.ones(len(capture), bool), "given")
         maker = DepthMaker(capture, poses)
@@ -161,6 +160,10 @@ def _measure_real(folder: Path, done: set[tuple]) -> Iterator[dict]:
         figures = measure_modes(maker, solved.rig, spread(len(capture), 2))
         told = {way: each.tell() for way, each in figures.items()}
         yield {"key": key, "trusted": solved.trusted, "notes": list(solved.notes), "figures": told, "cpu": cpu}
+
+
+def _hide(frame: Any, moving: np.ndarray) -> Any:
+    return dataclasses.replace(frame, usable=frame.usable & ~moving)
 
 
 def tell(rows: list[dict]) -> list[str]:
@@ -176,7 +179,8 @@ def tell(rows: list[dict]) -> list[str]:
         f"border: the outer {_BORDER} pixels of an object; *within*: captures with objects ≤ 1.6 mm, border ≤ 4 mm and "
         "≥ 95 % filled.",
         "",
-        "| calibration | way | captures | objects, median | worst | bias | border, 75 % | worst | filled | table | within |",
+        "| calibration | way | captures | objects, median | worst | bias | border, 75 % | worst | filled | table | "
+        "within |",
         "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for told in (True, False):
