@@ -104,8 +104,10 @@ class Verifier:
         crop = candidate.crop
         patches = describe_crop(self.estimator, crop, self.watch)
         about = crop.view, crop.camera_from_crop
+        # Which pieces of a frame are worth a second look shows without drawing; what is told was drawn.
+        drawn = where == POSED
         with self.watch(stage):
-            result = self.estimator.run(candidate.index, *about, seed=self.seed, patches=patches)
+            result = self.estimator.run(candidate.index, *about, seed=self.seed, patches=patches, drawn=drawn)
         self.watch.move("compile", result.seconds.get("compile", 0.0), stage)
         return Trial(candidate, result, self._value(result.estimate), where, earlier)
 

@@ -95,6 +95,7 @@ class Estimator:
         seed: int = 0,
         diameter: float | None = None,
         patches: Patches | None = None,
+        drawn: bool = True,
     ) -> Result:
         """Estimate one object in its crop.
 
@@ -104,6 +105,8 @@ class Estimator:
             seed: same seed, same answer.
             diameter: the object's true diameter in metres, where it is known.
             patches: of the view, where it has been described already.
+            drawn: without it no candidate is drawn: half the time, and a rougher confidence. Poses of objects from a
+                photo are found or chosen by drawing, and stay as they are.
         """
         templates, info = self.objects[index]
         if self._compacted.get(index) is not templates:
@@ -121,7 +124,10 @@ class Estimator:
             seconds["describe"] = time.perf_counter() - start
 
         query = Query(patches=described, view=view)
-        arguments = self.encoder, templates, query, key, self.config, known
+        config = self.config
+        if not drawn and templates.reference is None:
+            config = dataclasses.replace(config, score=dataclasses.replace(config.score, drawn=0))
+        arguments = self.encoder, templates, query, key, config, known
         estimate_compiled = self.compiled("estimate", estimate, seconds, *arguments)
         start = time.perf_counter()
         found = jax.block_until_ready(estimate_compiled(*arguments))
