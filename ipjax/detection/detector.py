@@ -75,6 +75,7 @@ class Detector:
         self.detection = detection
         self.proposals = proposals
         config = Config.fast() if config is None else config
+        config = dataclasses.replace(config, confidence=dataclasses.replace(config.confidence, drawn=detection.drawn))
         self.estimator = Estimator(thinned, encoder, config, quick=quick, alike=True, **options)
         self.options = {"resolution": sizes[0]} | self.estimator.options
         self.zoom = _usable_zoom(thinned[0][0], sizes[0], detection.zoom)

@@ -59,7 +59,7 @@ def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Similarity[np.
         vertices = _smooth(welded, STEPS[level])
         worse = dataclasses.replace(unit, vertices=vertices[welded.place], normals=unit.normals)
         worse = _blur(worse, welded, BLUR[level])
-        worse = _bump(worse, BUMPS[level], random)
+        worse = roughen(worse, BUMPS[level], random)
     else:
         worse = _blur(unit, welded, BLUR[level])
         if worse.texture is not None and worse.uv is not None:
@@ -71,7 +71,7 @@ def degrade(mesh: Mesh, level: int, seed: int = 0) -> tuple[Mesh, Similarity[np.
             colours[back] = np.round(worse.colours[~back].astype(np.float64).mean(0)).astype(np.uint8)
             worse = dataclasses.replace(worse, colours=colours)
         worse = _cluster(worse, random)
-        worse = _bump(worse, BUMPS[level], random)
+        worse = roughen(worse, BUMPS[level], random)
         worse = dataclasses.replace(worse, vertices=worse.vertices * np.array(STRETCH))
         if level == 4:
             worse = _remove_patches(worse, random)
@@ -135,7 +135,7 @@ def _smooth(welded: _Welded, steps: int) -> np.ndarray:
     return vertices
 
 
-def _bump(mesh: Mesh, amplitude: float, random: np.random.Generator) -> Mesh:
+def roughen(mesh: Mesh, amplitude: float, random: np.random.Generator) -> Mesh:
     """Move vertices along their normals by a smooth random field of the given rms."""
     waves = 64
     frequency = random.standard_normal((waves, 3)) / BUMP_LENGTH
