@@ -180,7 +180,7 @@ def judge(name: str, probability: np.ndarray, right: np.ndarray) -> None:
     sure = probability >= least
     print(
         f"{name}: {right.sum()} of {len(right)} are right; called present: {(sure & right).sum()} right, "
-        f"{(sure & ~right).sum()} wrong; right ones surer than all wrong ones: {(probability[right] > worst).mean():.0%}; "
+        f"{(sure & ~right).sum()} wrong; right ones above all wrong: {(probability[right] > worst).mean():.0%}; "
         f"log loss {-np.log(told).mean():.3f}"
     )
 
