@@ -1,7 +1,7 @@
 """The poses of a capture, refined: depth images brought to agree, with recognised points of the colours.
 
 RobotP refines its poses inside groups of frames that look alike, and then all together; ``stages`` has that, and all
-together from the start, which is as good and quicker (benchmarks/results/capture_refinement.md) and the default.
+together from the start, which ends at the same poses, is quicker, and is the default (`benchmarks.captures refine`).
 """
 
 import dataclasses
