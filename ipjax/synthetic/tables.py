@@ -12,6 +12,8 @@ from ipjax.synthetic.objects import KINDS, face_areas, make_object
 from ipjax.synthetic.textures import TEXTURE, make_marble, make_palette
 from ipjax.transforms import rotation_from_vector
 
+TABLE = (1.2, 0.9)  # metres: of the table top that `make_room` makes
+
 
 @functools.lru_cache(maxsize=10 * len(KINDS))
 def make_clutter(number: int) -> Mesh:
@@ -107,7 +109,8 @@ def make_room(rng: np.random.Generator) -> list[Mesh]:
     if rng.uniform() < 0.4:
         grain[:] = grain[:, :1]  # wood
     grain = grain + rng.normal(0, rng.uniform(1, 8), grain.shape)
-    table = np.array([[-0.6, -0.45, 0], [0.6, -0.45, 0], [0.6, 0.45, 0], [-0.6, 0.45, 0]])
+    x, y = TABLE[0] / 2, TABLE[1] / 2
+    table = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
     square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     two = np.array([[0, 1, 2], [0, 2, 3]])
     wall = make_marble(rng, TEXTURE, second, second * rng.uniform(0.7, 1.0)) + rng.normal(0, 4, (TEXTURE, TEXTURE, 1))

@@ -48,6 +48,8 @@ class Drawn(NamedTuple):
     support: Float[Array, "h w"]  # sum of the weights of the sources that its colours are from; 0 = unknown
 
 
+_OF_EACH = ("depth", "rotation", "translation", "weight")
+_SLOPE = 3  # tolerances from pixel to pixel that are a slope, and no jump
 _REFINEMENTS = 2  # times that a depth is replaced by what the sources measured where it puts the surface
 
 
@@ -62,12 +64,17 @@ def draw_view(
 ) -> Drawn:
     """The image and the depth that a camera sees, height × width pixels. Vmap over views.
 
-    Time: 3 k splats of the sources' pixels and 2 k² + 3 k look-ups a pixel; memory: O(k (h w + height · width)).
+    Time: 3 k splats of the sources' pixels and 2 k² + 5 k look-ups a pixel; memory: O(k (h w + height · width)).
     """
     rays = _rays(height, width, focal, centre)
-    guesses = jax.vmap(lambda *source: _carry(*source, sources, focal, centre, height, width))(
-        sources.depth, sources.rotation, sources.translation, sources.weight > 0
-    )
+
+    def guess(*one):
+        """A source's guesses, put where the view's rays meet what it measured: splats are of whole pixels."""
+        alone = sources._replace(**{name: part[None] for name, part in zip(_OF_EACH, one, strict=True)})
+        carried = _carry(*one, sources, focal, centre, height, width)
+        return jax.vmap(lambda z: jnp.where(z > 0, _look(z, rays, alone, rules, focal).depth[0], 0))(carried)
+
+    guesses = jax.vmap(guess)(*(getattr(sources, name) for name in _OF_EACH))
 
     def judge(best, guess):
         depth, score = best
@@ -148,7 +155,7 @@ def _carry(
     depth: Float[Array, "h w"],
     rotation: Float[Array, "3 3"],
     translation: Float[Array, "3"],
-    there: Bool[Array, ""],
+    weight: Float[Array, ""],
     sources: Sources,
     focal: Float[Array, "2"],
     centre: Float[Array, "2"],
@@ -161,7 +168,7 @@ def _carry(
     rows, columns = depth.shape
     points = (_rays(rows, columns, sources.focal, sources.centre) * depth[..., None]).reshape(-1, 3)
     points = jnp.sum(rotation.T[None] * (points - translation)[:, None, :], axis=-1)
-    valid = (depth.reshape(-1) > 0) & there
+    valid = (depth.reshape(-1) > 0) & (weight > 0)
     z = points[:, 2:]
     behind = jnp.asarray(0.01, depth.dtype)
     fine, _ = splat_colours(points, z, valid, focal, centre, height, width, behind)
@@ -218,4 +225,4 @@ def _between_alike(
     low, high = jnp.min(four, axis=0), jnp.max(four, axis=0)
     weight = jnp.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y])
     closest = jnp.take_along_axis(four, jnp.argmax(weight, axis=0)[None], axis=0)[0]
-    return jnp.where((low > 0) & (high - low <= tolerance * low), jnp.sum(weight * four, axis=0), closest)
+    return jnp.where((low > 0) & (high - low <= _SLOPE * tolerance * low), jnp.sum(weight * four, axis=0), closest)

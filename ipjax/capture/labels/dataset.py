@@ -8,12 +8,15 @@ https://github.com/thodan/bop_toolkit/blob/master/docs/bop_datasets_format.md, s
     test/000000/scene_camera.json, scene_gt.json, scene_gt_info.json
 """
 
+import dataclasses
 import json
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from ipjax.bop.dataset import VISIBLE
 from ipjax.capture.labels.masks import FrameLabels
@@ -28,6 +31,26 @@ from ipjax.files.storage.writing import write_text, writing
 DEPTH_SCALE = 0.1  # millimetres per number of the depth images: up to 6.5 m
 
 
+@dataclasses.dataclass(frozen=True)
+class LabelledScene:
+    """One scene of a data set."""
+
+    frames: Sequence[PosedFrame]
+    labels: Sequence[FrameLabels]
+    # Of each entry of the labels, its model's place in the data set's; None = the same order.
+    which: tuple[int, ...] | None = None
+    # Further images of every frame, by the name of their folder.
+    beside: Mapping[str, Sequence[UInt8[np.ndarray, "h w"]]] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        if len(self.frames) != len(self.labels):
+            raise ValueError(f"{len(self.frames)} frames have {len(self.labels)} labels")
+
+    def number(self, entry: int) -> int:
+        """The object's number of an entry of the labels."""
+        return 1 + (entry if self.which is None else self.which[entry])
+
+
 def write_dataset(
     root: str | Path,
     models: Sequence[ObjectModel],
@@ -35,7 +58,26 @@ def write_dataset(
     labels: Sequence[FrameLabels],
     *,
     split: str = "test",
-    scene: int = 0,
+    replace: bool = False,
+    about: dict[str, Any] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """`write_scenes` of one scene, in which every model stands once.
+
+    Raises:
+      OSError: the folder is there already, or cannot be written.
+      ValueError: frames and labels are not as many.
+    """
+    scene = LabelledScene(frames, labels)
+    return write_scenes(root, models, [scene], split=split, replace=replace, about=about, progress=progress)
+
+
+def write_scenes(
+    root: str | Path,
+    models: Sequence[ObjectModel],
+    scenes: Sequence[LabelledScene],
+    *,
+    split: str = "test",
     replace: bool = False,
     about: dict[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -44,57 +86,70 @@ def write_dataset(
 
     Args:
       root: the folder.
+      models: none = there is no folder of models.
       replace: a folder that is there gives way.
       about: what else ``dataset_info.json`` says.
 
     Raises:
       OSError: the folder is there already, or cannot be written.
-      ValueError: frames and labels are not as many.
     """
-    if len(frames) != len(labels):
-        raise ValueError(f"{len(frames)} frames have {len(labels)} labels")
+    targets, total, done = [], sum(len(scene.frames) for scene in scenes), 0
     with writing_folder(root, replace=replace) as folder:
-        _write_models(folder, models)
-        place = folder / split / f"{scene:06d}"
-        for kind in ("rgb", "depth", "mask", "mask_visib"):
-            (place / kind).mkdir(parents=True)
-        cameras, truths, infos, targets = {}, {}, {}, []
-        for number, (frame, label) in enumerate(zip(frames, labels, strict=True)):
-            _write_images(place, number, frame, label)
-            pose = frame.camera_from_world
-            cameras[str(number)] = {
-                "cam_K": frame.camera.ravel().tolist(),
-                "depth_scale": DEPTH_SCALE,
-                "cam_R_w2c": pose.rotation.ravel().tolist(),
-                "cam_t_w2c": (1000 * pose.translation).tolist(),
-            }
-            truths[str(number)] = [
-                {
-                    "cam_R_m2c": pose.rotation.ravel().tolist(),
-                    "cam_t_m2c": (1000 * pose.translation).tolist(),
-                    "obj_id": index + 1,
-                }
-                for index, pose in enumerate(label.camera_from_model)
-            ]
-            infos[str(number)] = _describe(frame, label)
-            targets += [
-                {"scene_id": scene, "im_id": number, "obj_id": index + 1, "inst_count": 1}
-                for index, share in enumerate(label.shares)
-                if share >= VISIBLE
-            ]
-            if progress is not None:
-                progress(number + 1, len(frames))
-        for name, document in (("scene_camera", cameras), ("scene_gt", truths), ("scene_gt_info", infos)):
-            write_text(place / f"{name}.json", json.dumps(document))
-        width, height = frames[0].size
-        K = frames[0].camera
+        if models:
+            _write_models(folder, models)
+        for number, scene in enumerate(scenes):
+            place = folder / split / f"{number:06d}"
+            for kind in ("rgb", "depth", "mask", "mask_visib", *scene.beside):
+                (place / kind).mkdir(parents=True)
+            targets += _write_scene(
+                place, number, scene, lambda now, done=done: progress and progress(done + now, total)
+            )
+            done += len(scene.frames)
+        first = scenes[0].frames[0]
+        (width, height), K = first.size, first.camera
         camera = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
         write_text(folder / "camera.json", json.dumps({**camera, "depth_scale": DEPTH_SCALE}, indent=1))
         write_text(folder / "test_targets_bop19.json", json.dumps(targets))
         names = {str(index + 1): model.name for index, model in enumerate(models)}
-        told = {"objects": names, "frames": [frame.name for frame in frames], **(about or {})}
-        write_text(folder / "dataset_info.json", json.dumps(told, indent=1))
+        frames = [frame.name for scene in scenes for frame in scene.frames]
+        write_text(
+            folder / "dataset_info.json", json.dumps({"objects": names, "frames": frames, **(about or {})}, indent=1)
+        )
     return Path(root)
+
+
+def _write_scene(place: Path, number: int, scene: LabelledScene, tell: Callable[[int], object]) -> list[dict[str, int]]:
+    """One scene's images and documents; returns its targets."""
+    cameras, truths, infos, targets = {}, {}, {}, []
+    for image, (frame, label) in enumerate(zip(scene.frames, scene.labels, strict=True)):
+        _write_images(place, image, frame, label)
+        for kind, images in scene.beside.items():
+            _write_image(place / kind / f"{image:06d}.png", images[image])
+        pose = frame.camera_from_world
+        cameras[str(image)] = {
+            "cam_K": frame.camera.ravel().tolist(),
+            "depth_scale": DEPTH_SCALE,
+            "cam_R_w2c": pose.rotation.ravel().tolist(),
+            "cam_t_w2c": (1000 * pose.translation).tolist(),
+        }
+        truths[str(image)] = [
+            {
+                "cam_R_m2c": pose.rotation.ravel().tolist(),
+                "cam_t_m2c": (1000 * pose.translation).tolist(),
+                "obj_id": scene.number(entry),
+            }
+            for entry, pose in enumerate(label.camera_from_model)
+        ]
+        infos[str(image)] = _describe(frame, label)
+        shown = Counter(scene.number(entry) for entry, share in enumerate(label.shares) if share >= VISIBLE)
+        targets += [
+            {"scene_id": number, "im_id": image, "obj_id": thing, "inst_count": count}
+            for thing, count in sorted(shown.items())
+        ]
+        tell(image + 1)
+    for name, document in (("scene_camera", cameras), ("scene_gt", truths), ("scene_gt_info", infos)):
+        write_text(place / f"{name}.json", json.dumps(document))
+    return targets
 
 
 def _write_models(folder: Path, models: Sequence[ObjectModel]) -> None:

@@ -44,10 +44,14 @@ def label_frames(
     models: Sequence[ObjectModel],
     frames: Sequence[PosedFrame],
     *,
+    exact: bool = False,
     backend: str = "auto",
     progress: Callable[[int, int], None] | None = None,
 ) -> list[FrameLabels]:
     """Masks and boxes of all models in all frames.
+
+    Args:
+      exact: the frames are renderings of these very models, and nothing else hides them: they are not asked.
 
     Raises:
       ValueError: no models.
@@ -58,13 +62,21 @@ def label_frames(
     batch = max(_BATCH // len(models), 1)
     found = []
     for start in range(0, len(frames), batch):
-        found += _label_batch(models, frames[start : start + batch], backend)
+        found += _label_batch(models, frames[start : start + batch], exact, backend)
         if progress is not None:
             progress(len(found), len(frames))
     return found
 
 
-def _label_batch(models: Sequence[ObjectModel], frames: Sequence[PosedFrame], backend: str) -> list[FrameLabels]:
+def label_nothing(frame: PosedFrame) -> FrameLabels:
+    """The labels of a frame of which no object is known."""
+    none = np.zeros((0, *frame.depth.shape), bool)
+    return FrameLabels((), none, none, (), ())
+
+
+def _label_batch(
+    models: Sequence[ObjectModel], frames: Sequence[PosedFrame], exact: bool, backend: str
+) -> list[FrameLabels]:
     """As `label_frames`, of frames few enough to be drawn at once."""
     first = frames[0]
     width, height = first.size
@@ -98,7 +110,8 @@ def _label_batch(models: Sequence[ObjectModel], frames: Sequence[PosedFrame], ba
         silhouettes = alone.depth[number * len(models) : (number + 1) * len(models)] > 0
         whole = silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width]
         ids, drawn = together.ids[number], together.depth[number]
-        ids = snap(frame.rgb, settle(ids, drawn, frame), len(models), frame.usable)
+        if not exact:
+            ids = snap(frame.rgb, settle(ids, drawn, frame), len(models), frame.usable)
         visible = np.stack([ids == k for k in range(len(models))])
         whole, silhouettes = whole | visible, silhouettes.copy()
         silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width] |= visible

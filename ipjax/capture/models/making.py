@@ -105,7 +105,7 @@ def fuse_scene(
     tell = lambda part: None if progress is None else lambda done, total: progress(part, done, total)
     points = np.concatenate([lift(frame, _STEP)[0] for frame in frames])
     support = find_support(frames, points)
-    gains = balance(frames, support)
+    gains = balance(frames, support.support_from_world)
     above = _lift_above(frames, support, config)
     blocks = choose_blocks(above, config.voxel, support.axes)
     volume = fuse(
@@ -167,17 +167,20 @@ def make_objects(
     return SceneModels(tuple(objects), fused.scene, support, _note(objects, support))
 
 
-def balance(frames: Sequence[PosedFrame], support: Support, cell: float = 0.01) -> Float[np.ndarray, "v 3"]:
+def balance(
+    frames: Sequence[PosedFrame], grid_from_world: Similarity[np.ndarray], cell: float = 0.01
+) -> Float[np.ndarray, "v 3"]:
     """By what every frame's colours are multiplied so that all have one exposure and white balance.
 
-    The same place is compared where several frames see it; the mean of all gains is 1.
+    The same place is compared where several frames see it, in cells of a grid of which the scene is in the middle; the
+    mean of all gains is 1.
     """
     from scipy import sparse
 
     rows, columns, values = [], [], []
     for number, frame in enumerate(frames):
         points, rgb = lift(frame, 5)
-        place = support.support_from_world @ points
+        place = grid_from_world @ points
         key = np.floor(place / cell).astype(np.int64)
         good = (np.abs(key) < 200).all(1) & (rgb.min(1) > 8) & (rgb.max(1) < 247)
         code = ((key[good] + 200) * np.array([160801, 401, 1])).sum(1)

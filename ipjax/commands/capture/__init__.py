@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from ipjax.commands.capture import check, depth, label, model, pose, refine
+from ipjax.commands.capture import arrange, check, depth, label, model, pose, refine, views
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (check, pose, refine, depth, model, label)  # as --help lists them
+STEPS = (check, pose, refine, depth, model, label, views, arrange)  # as --help lists them
 EXAMPLES = """\
 examples:
   ipjax capture check table/ -o check.html     what it has, what is missing, and what looks wrong
@@ -14,6 +14,8 @@ examples:
   ipjax capture depth table/ -o work/          depth in the pixels of the colours, without holes: work/depth/
   ipjax capture model table/ -o work/          models of what stands on the table: work/models/
   ipjax capture label table/ -o work/          masks, boxes and poses of every frame, in BOP's layout: work/dataset/
+  ipjax capture views table/ -o work/          the scene as other cameras would see it: work/views/
+  ipjax capture arrange work/models/ -o made/  the models in new arrangements, with the truth
 
 A capture is a folder of frames: rgb/NAME.png, depth/NAME.png (registered to the colours), camera.json, and, if they are
 known, poses.json and ignore.png (non-zero = moves with the camera); a TUM RGB-D sequence; or a scene of a BOP data set.

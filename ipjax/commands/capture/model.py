@@ -95,15 +95,17 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     return 0
 
 
-def open_frames(arguments: argparse.Namespace, work: Path) -> Any:
-    """The frames of the capture with the best poses and depth that the steps before left in the folder."""
+def open_frames(arguments: argparse.Namespace, work: Path, poses: Path | None = None) -> Any:
+    """The frames of the capture with the best poses and depth that the steps before left in the folder, or with the
+    poses of a file.
+    """
     from ipjax.capture.models.frames import CaptureFrames
     from ipjax.capture.records import CaptureError
     from ipjax.capture.trajectories import read_trajectory
     from ipjax.files.images.masks import read_mask
 
     capture = open_given(arguments, poses=False)
-    found = find_poses(work)
+    found = poses or find_poses(work)
     if found is None:
         raise CaptureError(f"{work}: it has no poses.json; make it with ipjax capture pose")
     improved, hidden = work if (work / "depth").is_dir() else None, work / "ignore.png"
@@ -121,9 +123,9 @@ def find_poses(work: Path) -> Path | None:
     return next((path for path in (work / "refined.json", work / "poses.json") if path.is_file()), None)
 
 
-def describe_inputs(arguments: argparse.Namespace, work: Path, about: dict[str, Any]) -> str:
+def describe_inputs(arguments: argparse.Namespace, work: Path, about: dict[str, Any], poses: Path | None = None) -> str:
     """A word that is another whenever the capture, the poses, the depth or the settings are."""
-    files = [path for path in (find_poses(work), work / "ignore.png") if path is not None and path.is_file()]
+    files = [path for path in (poses or find_poses(work), work / "ignore.png") if path is not None and path.is_file()]
     texts = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
     lists = {}
     for folder in (arguments.folder, work / "depth"):

@@ -12,10 +12,12 @@ def draw_view(sources, rules, focal, centre, height, width):
     focal, centre = np.asarray(focal, np.float64), np.asarray(centre, np.float64)
     count, rows, columns = depths.shape
     guesses = [
-        guess
+        (k, guess)
         for k in range(count)
         if weights[k] > 0
-        for guess in _carry(depths[k], rotations[k], translations[k], own_focal, own_centre, focal, centre, height, width)
+        for guess in _carry(
+            depths[k], rotations[k], translations[k], own_focal, own_centre, focal, centre, height, width
+        )
     ]
     image, drawn, support = np.zeros((height, width, 3)), np.zeros((height, width)), np.zeros((height, width))
     for row in range(height):
@@ -53,7 +55,12 @@ def draw_view(sources, rules, focal, centre, height, width):
                 return found
 
             depth = score = 0.0
-            for guess in (image_of_guesses[row, column] for image_of_guesses in guesses):
+            for k, carried in guesses:
+                guess = carried[row, column]
+                if guess <= 0:
+                    continue
+                own = look(guess)[k]
+                guess = guess if own is None else own[4]
                 if guess <= 0:
                     continue
                 total = sum(one[1] * (one[2] - one[3]) for one in look(guess) if one is not None)
@@ -147,7 +154,7 @@ def _between(image, pixel):
 def _between_alike(depth, pixel, tolerance):
     places, weights = _corners(pixel, *depth.shape)
     four = [depth[place] for place in places]
-    if min(four) > 0 and max(four) - min(four) <= tolerance * min(four):
+    if min(four) > 0 and max(four) - min(four) <= 3 * tolerance * min(four):
         return sum(weight * z for weight, z in zip(weights, four, strict=True))
     return four[int(np.argmax(weights))]
 
