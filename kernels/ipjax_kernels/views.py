@@ -2,10 +2,10 @@
 
 Each frame's depth is carried into the view, where it is a guess of what is seen; a guess holds if the frames that look
 at it see it there rather than through it (visibility by consensus, as in P. Merrell et al., "Real-time visibility-based
-fusion of depth maps", ICCV 2007). Of those that hold the nearest is taken. Colours are then fetched from the frames that
-see the same place, by how near their rays are, how finely they see it and how well their depth agrees (C. Buehler et
-al., "Unstructured lumigraph rendering", SIGGRAPH 2001). So nothing is blended across a silhouette, and what no frame
-knows stays unknown. :func:`ipjax_kernels.reference.views` has the same as loops.
+fusion of depth maps", 2007). Of those that hold the nearest is taken. Colours are then fetched from the frames that see
+the same place, by how near their rays are, how finely they see it and how well their depth agrees (C. Buehler et al.,
+"Unstructured lumigraph rendering", 2001). So nothing is blended across a silhouette, and what no frame knows stays
+unknown. :func:`ipjax_kernels.reference.views` has the same as loops.
 """
 
 from functools import partial

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from ipjax_kernels.reference import views as reference
 from ipjax_kernels.views import Rules, Sources, draw_view
 

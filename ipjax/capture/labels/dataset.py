@@ -101,9 +101,8 @@ def write_scenes(
             place = folder / split / f"{number:06d}"
             for kind in ("rgb", "depth", "mask", "mask_visib", *scene.beside):
                 (place / kind).mkdir(parents=True)
-            targets += _write_scene(
-                place, number, scene, lambda now, done=done: progress and progress(done + now, total)
-            )
+            tell = None if progress is None else lambda now, done=done: progress(done + now, total)
+            targets += _write_scene(place, number, scene, tell)
             done += len(scene.frames)
         first = scenes[0].frames[0]
         (width, height), K = first.size, first.camera
@@ -112,13 +111,14 @@ def write_scenes(
         write_text(folder / "test_targets_bop19.json", json.dumps(targets))
         names = {str(index + 1): model.name for index, model in enumerate(models)}
         frames = [frame.name for scene in scenes for frame in scene.frames]
-        write_text(
-            folder / "dataset_info.json", json.dumps({"objects": names, "frames": frames, **(about or {})}, indent=1)
-        )
+        told = {"objects": names, "frames": frames, **(about or {})}
+        write_text(folder / "dataset_info.json", json.dumps(told, indent=1))
     return Path(root)
 
 
-def _write_scene(place: Path, number: int, scene: LabelledScene, tell: Callable[[int], object]) -> list[dict[str, int]]:
+def _write_scene(
+    place: Path, number: int, scene: LabelledScene, tell: Callable[[int], None] | None
+) -> list[dict[str, int]]:
     """One scene's images and documents; returns its targets."""
     cameras, truths, infos, targets = {}, {}, {}, []
     for image, (frame, label) in enumerate(zip(scene.frames, scene.labels, strict=True)):
@@ -146,7 +146,8 @@ def _write_scene(place: Path, number: int, scene: LabelledScene, tell: Callable[
             {"scene_id": number, "im_id": image, "obj_id": thing, "inst_count": count}
             for thing, count in sorted(shown.items())
         ]
-        tell(image + 1)
+        if tell is not None:
+            tell(image + 1)
     for name, document in (("scene_camera", cameras), ("scene_gt", truths), ("scene_gt_info", infos)):
         write_text(place / f"{name}.json", json.dumps(document))
     return targets

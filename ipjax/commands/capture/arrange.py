@@ -20,9 +20,9 @@ examples:
   ipjax capture arrange ycbv/models/ -o made/ --things 8 --noise     models of a BOP data set, a cheap camera
   ipjax capture arrange mug.ipjax box.ipjax -o made/                 objects that were onboarded with --unit
 
-The models fall onto a table, one after another and turned at random, until all rest (MuJoCo; each collides as its convex
-hull). What falls off or is in another by more than 0.8 mm is dropped anew. Table, room and light are other in each scene;
-the light stays where it is as the camera moves. The same seed makes the same scenes.
+The models fall onto a table, one after another and turned at random, until all rest (MuJoCo; each collides as its
+convex hull). What falls off, or is in another by more than 0.8 mm, is dropped anew. Table, room and light are other in
+each scene; the light stays where it is as the camera moves. The same seed makes the same scenes.
 
 Writes a data set in BOP's layout: images, exact depth (--noise: as a structured-light camera has it), masks, poses,
 boxes, visible shares, models; and DATASET.png beside it.
@@ -32,9 +32,7 @@ boxes, visible shares, models; and DATASET.png beside it.
 def add(steps: Any) -> None:
     """The step and its options."""
     parser = add_command(steps, "arrange", run, "draw models in new arrangements, with the truth", EXAMPLES)
-    parser.add_argument(
-        "models", type=Path, nargs="+", metavar="MODELS", help="folders of models, meshes, object files"
-    )
+    parser.add_argument("models", type=Path, nargs="+", metavar="MODELS", help="folders, meshes, object files")
     options.add_output(parser, "DATASET", "folder of the data set", required=True)
     parser.add_argument("--unit", choices=("m", "cm", "mm", "inch"), default="m", help="of mesh files (default m)")
     parser.add_argument("--scenes", type=parse_count, default=1, metavar="N", help="arrangements (default 1)")

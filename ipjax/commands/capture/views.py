@@ -26,8 +26,9 @@ Paths: orbit = a circle around the middle of the scene, as far and as high as th
 where these did not go around); smooth = through all captured cameras, evenly; FILE = JSON, a list (or dictionary) of
 4 x 4 matrices world_from_camera in metres, in the world of the poses, OpenCV's axes: x right, y down, z ahead.
 
-Reads WORK/refined.json or WORK/poses.json, and WORK/depth/ if the step depth made it. Writes a data set in BOP's layout,
-WORK/views/ or where --dataset says, with masks and poses of the objects if WORK/models/ is there; and WORK/views.png.
+Reads WORK/refined.json or WORK/poses.json, and WORK/depth/ if the step depth made it. Writes a data set in BOP's
+layout, WORK/views/ or where --dataset says, with masks and poses of the objects if WORK/models/ is there; and
+WORK/views.png.
 """
 
 
@@ -36,15 +37,9 @@ def add(steps: Any) -> None:
     parser = add_command(steps, "views", run, "draw the scene as other cameras would see it", EXAMPLES)
     add_capture(parser)
     options.add_output(parser, "WORK", "folder of what the steps make", required=True)
-    parser.add_argument(
-        "--poses", type=Path, metavar="FILE", help="of the frames (default: WORK/refined.json, poses.json)"
-    )
-    parser.add_argument(
-        "--path", default="orbit", metavar="orbit|smooth|FILE", help="of the new cameras (default orbit)"
-    )
-    parser.add_argument(
-        "--count", type=parse_count, metavar="N", help="of the new cameras (default 36; of a FILE, all)"
-    )
+    parser.add_argument("--poses", type=Path, metavar="FILE", help="of the frames (default: those in WORK)")
+    parser.add_argument("--path", default="orbit", metavar="orbit|smooth|FILE", help="of new cameras (default orbit)")
+    parser.add_argument("--count", type=parse_count, metavar="N", help="of new cameras (default 36; a FILE: all)")
     parser.add_argument("--dataset", type=Path, metavar="DATASET", help="the data set (default WORK/views)")
     add_again(parser)
     options.add_reporting(parser, quiet="no progress bar")

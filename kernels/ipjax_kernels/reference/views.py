@@ -11,14 +11,10 @@ def draw_view(sources, rules, focal, centre, height, width):
     tolerance, turn, edge = (float(rule) for rule in rules)
     focal, centre = np.asarray(focal, np.float64), np.asarray(centre, np.float64)
     count, rows, columns = depths.shape
-    guesses = [
-        (k, guess)
-        for k in range(count)
-        if weights[k] > 0
-        for guess in _carry(
-            depths[k], rotations[k], translations[k], own_focal, own_centre, focal, centre, height, width
-        )
-    ]
+    guesses = []
+    for k in np.flatnonzero(weights > 0):
+        pose = rotations[k], translations[k]
+        guesses += [(k, g) for g in _carry(depths[k], *pose, own_focal, own_centre, focal, centre, height, width)]
     image, drawn, support = np.zeros((height, width, 3)), np.zeros((height, width)), np.zeros((height, width))
     for row in range(height):
         for column in range(width):
