@@ -34,7 +34,7 @@ def _draw(view: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
     stripes = np.where((((rows + columns) // 6) % 2)[..., None] > 0, *_UNKNOWN).astype(np.uint8)
     known = view.usable[..., None]
     depth = np.where(view.depth > 0, view.depth, np.nan)
-    near, far = np.nanpercentile(depth, (1, 97)) if view.usable.any() else (0.0, 1.0)
+    near, far = np.nanpercentile(depth, (1, 80)) if view.usable.any() else (0.0, 1.0)
     bright = np.nan_to_num(np.clip((far - depth) / max(far - near, 1e-6), 0, 1)) * 215 + 40
     grey = np.repeat(bright.astype(np.uint8)[..., None], 3, -1)
     both = np.hstack([np.where(known, view.rgb, stripes), np.where(known, grey, stripes)])

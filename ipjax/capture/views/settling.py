@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from ipjax.capture.records import CaptureError
@@ -21,7 +21,6 @@ from ipjax.transforms import Similarity
 
 _CHILD = Path(__file__).with_name("settling_child.py")
 _CORNERS = 120  # of a hull at most: contacts of more would take long and say the same
-_TRIES = 8
 _TIMEOUT = 120  # seconds
 
 
@@ -35,6 +34,7 @@ class SettlingConfig:
     density: float = 400.0  # kg / m³, of the hulls
     step: float = 0.002  # seconds
     longest: float = 3.0  # seconds until each thing must rest
+    tries: int = 8  # times that everything is dropped anew, if it must be
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,7 +72,7 @@ def settle(meshes: Sequence[Mesh], seed: int = 0, config: SettlingConfig | None 
             f"{TABLE[0]:g} × {TABLE[1]:g} m; is its unit right?"
         )
     reasons = []
-    for attempt in range(_TRIES):
+    for attempt in range(config.tries):
         places = rng.uniform(-config.spread, config.spread, (len(meshes), 2))
         turns = rng.normal(size=(len(meshes), 4))
         turns /= np.linalg.norm(turns, axis=1, keepdims=True)
@@ -87,7 +87,8 @@ def settle(meshes: Sequence[Mesh], seed: int = 0, config: SettlingConfig | None 
             return Settled(tuple(poses), max(float(found["deep"]), 0.0), attempt + 1)
         reasons.append(reason)
     raise CaptureError(
-        f"{len(meshes)} things do not come to rest on the table, in {_TRIES} tries ({reasons[-1]}); take fewer of them"
+        f"{len(meshes)} things do not come to rest on the table, in {config.tries} tries ({reasons[-1]}); "
+        "take fewer of them"
     )
 
 
@@ -137,8 +138,11 @@ def _simulate(
 
 
 def _hull(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m 3"]:
-    """Corners of the convex hull, or of one a little larger where it has too many."""
-    corners = points[ConvexHull(points).vertices]
+    """Corners of the convex hull, or of one a little larger where it has too many; CaptureError where it is flat."""
+    try:
+        corners = points[ConvexHull(points).vertices]
+    except QhullError:
+        raise CaptureError("a model is flat: it has no inside, and cannot be dropped") from None
     if len(corners) <= _CORNERS:
         return corners
     # Support points in evenly spread directions, pushed out so that all of the hull is inside.
