@@ -114,14 +114,14 @@ def _pretend(made: Any, seed: int, told: bool) -> tuple[Any, Any]:
     rng, count = np.random.default_rng([seed, 7]), len(made.names)
     # Lengths of the three axes together have these medians: 1.54 is the median length of a standard normal vector.
     step = np.concatenate([rng.normal(0, spread / 1.54, (count, 3)) for spread in SPREAD], axis=1)
-    poses = made.world_from_camera @ Similarity.exp(step)
+    poses = made.world_from_camera @ Similarity[np.ndarray].exp(step)
     return capture, Trajectory(made.names, poses, np.ones(count, bool), "true, disturbed")
 
 
 def _compare(depth: np.ndarray, truth: np.ndarray, ids: np.ndarray) -> list[float]:
     """Objects: median error and bias (mm), 75 % of their borders (mm), filled (%); table: median (mm)."""
     objects, known = ids >= 0, depth > 0
-    border = objects & ndimage.binary_dilation(~objects, iterations=_BORDER)
+    border = objects & np.asarray(ndimage.binary_dilation(~objects, iterations=_BORDER), bool)
     table = ~objects & (truth < 1.2) & known
     error = 1e3 * (depth - truth)
     percentile = lambda where, share: float(np.percentile(np.abs(error[where]), share)) if where.any() else np.nan
@@ -152,6 +152,8 @@ def _measure_real(folder: Path, done: set[tuple]) -> Iterator[dict]:
         capture = dataclasses.replace(
             capture, read_frame=lambda index, read=read, moving=moving: _hide(read(index), moving)
         )
+        if capture.world_from_camera is None:
+            continue
         poses = Trajectory(capture.names, capture.world_from_camera, np.ones(len(capture), bool), "given")
         maker = DepthMaker(capture, poses)
         start = time.process_time()

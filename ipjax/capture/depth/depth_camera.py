@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from ipjax.cameras import project, unproject
 from ipjax.capture.depth.rigs import TOLD, UNTOLD, Rig, SolvedRig, decide, difference, leave
-from ipjax.transforms import Similarity
+from ipjax.transforms import Similarity, rotation_from_vector
 
 WIDTHS = (0.04, 0.02, 0.01, 0.006, 0.004)  # of the robust kernel, metres, from coarse to fine
 _STEPS = 4  # of Gauss-Newton at each width
@@ -132,7 +132,7 @@ def _descend(problem: _Problem, first: Rig, widths: Sequence[float]) -> tuple[Ri
 
 def _move(rig: Rig, step: Float[np.ndarray, "8"]) -> Rig:
     back = rig.colour_from_depth.inverse()
-    turn = Similarity.exp(np.concatenate([step[:3], np.zeros(3)])).rotation
+    turn = rotation_from_vector(step[:3])
     moved = Similarity(turn @ back.rotation, back.translation + step[3:6], np.ones(()))
     K = rig.depth_camera.copy()
     K[[0, 1], [0, 1]] *= np.exp(step[6])

@@ -101,7 +101,7 @@ def _edge_contrast(rgb: np.ndarray, depth: Float[np.ndarray, "h w"]) -> float:
     jumps = find_jumps(depth)
     if jumps.sum() < 50:
         return np.nan
-    away = ndimage.distance_transform_edt(~jumps)
+    away = np.asarray(ndimage.distance_transform_edt(~jumps))
     beside = (away > 5) & (away < 8)
     return float(steep[jumps].mean() / max(steep[beside].mean(), 1e-6))
 

@@ -40,7 +40,7 @@ class Rig:
     @staticmethod
     def from_json(document: dict[str, Any]) -> "Rig":
         """What `to_json` told."""
-        pose = Similarity.from_matrix(np.array(document["colour_from_depth"], float))
+        pose = Similarity[np.ndarray].from_matrix(np.array(document["colour_from_depth"], float))
         return Rig(np.array(document["K"], float), pose, float(document["scale"]))
 
 

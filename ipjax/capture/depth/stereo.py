@@ -3,9 +3,8 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import jax
 import numpy as np
-from ipjax_kernels.depth.sweep import Sweep, sweep
+from ipjax_kernels.depth.sweep import sweep
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
@@ -164,16 +163,17 @@ def sweep_view(
         radius=radius,
         keep=2,
     )
-    found = Sweep(*(np.asarray(x, np.float64) for x in jax.device_get(found)))
-    inverse = np.where(start > 0, found.inverse, 0) if base is not None else found.inverse
+    inverse, score, runner_up, curvature = (np.asarray(x, np.float64) for x in found)
+    if base is not None:
+        inverse = np.where(start > 0, inverse, 0)
     depth = np.where(inverse > 0, 1 / np.maximum(inverse, 1e-6), 0)
     # Of a peak 1 − ½ c d² whose height is uncertain by 1 − score over a window, the place is uncertain by this.
-    planes = np.sqrt(np.maximum(1 - found.score, 0.01) / (np.maximum(found.curvature, 1e-6) * (2 * radius + 1)))
+    planes = np.sqrt(np.maximum(1 - score, 0.01) / (np.maximum(curvature, 1e-6) * (2 * radius + 1)))
     deviation = np.where(depth > 0, planes * (offsets[1] - offsets[0]) * depth**2, np.inf)
-    sure = (found.score > _LEAST_SCORE) & (depth > 0) & views.usable[place]
+    sure = (score > _LEAST_SCORE) & (depth > 0) & views.usable[place]
     if base is None:
-        sure &= found.score - found.runner_up > _LEAST_LEAD
-    return StereoDepth(depth, _keep_patches(depth, sure, radius), deviation, found.score)
+        sure &= score - runner_up > _LEAST_LEAD
+    return StereoDepth(depth, _keep_patches(depth, sure, radius), deviation, score)
 
 
 def _keep_patches(depth, sure, radius):

@@ -5,7 +5,7 @@ normalised cross-correlation. With a base image of inverse depth the planes beco
 lie along it instead of facing the camera.
 """
 
-from functools import partial
+from functools import partial, reduce
 from typing import NamedTuple
 
 import jax
@@ -126,8 +126,8 @@ def _box(image, radius):
     """Sums over windows; beyond the border is nothing."""
     height, width = image.shape
     padded = jnp.pad(image, radius)
-    rows = sum(padded[i : i + height] for i in range(2 * radius + 1))
-    return sum(rows[:, i : i + width] for i in range(2 * radius + 1))
+    rows = reduce(jnp.add, [padded[i : i + height] for i in range(2 * radius + 1)])
+    return reduce(jnp.add, [rows[:, i : i + width] for i in range(2 * radius + 1)])
 
 
 def _corners(image):
