@@ -10,7 +10,7 @@ import numpy as np
 from scipy import ndimage
 
 SPREAD = (np.deg2rad(0.05), 0.001)  # of the poses: standard deviation of the whole rotation (rad) and place (m)
-EVERY = 4  # frames of a made capture that are judged
+EVERY = 8  # frames of a made capture: each so-many-th is judged
 _BORDER = 3  # pixels inside an object that count as its border
 WAYS = ("factory", "paper", "true rig", "solved", "solved, smoothed", "fused", "fused with stereo")
 UNKNOWN = "unknown rig"
