@@ -15,8 +15,8 @@ TOLD = np.array([0.01] * 3 + [0.005] * 3 + [0.01, 0.003])
 UNTOLD = np.array([0.05] * 3 + [0.05, 0.03, 0.03] + [0.01, 0.003])
 
 # Standard deviations above which a rig is weakly determined; share and spread of the stereo that agrees with it.
-_WEAK_ROTATION, _WEAK_TRANSLATION = np.deg2rad(0.35), 0.004
-_LEAST_AGREEMENT, _WIDEST = 0.4, 0.006
+_WEAK_ROTATION, _WEAK_TRANSLATION = np.deg2rad(0.3), 0.004
+_LEAST_AGREEMENT, _WIDEST = 0.75, 0.006  # made captures: 0.95 and more; a gripped camera in a shelf: 0.55
 _FAR = 4  # standard deviations from the start
 _WORSE = 1.2  # times the spread of the start; the shift along a plane is in no spread, so that equal is no objection
 
