@@ -6,17 +6,24 @@ warped by the true rig. ``--open3d`` also fuses the same frames with Open3D's Vo
 PAGE``.
 """
 
+import argparse
+import json
+import subprocess
+import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.measure import describe_device
 from ipjax.capture.labels.masks import find_box, label_frames
 from ipjax.capture.models.frames import PosedFrame, trust_depth
 from ipjax.capture.models.making import ModelConfig, SceneModels
 from ipjax.capture.models.separation import Hint
+from ipjax.files.storage.writing import write_text
 from ipjax.synthetic.captures import MadeCapture, make_capture, register_depth
 from ipjax.transforms import Similarity
 

@@ -8,9 +8,9 @@ from jaxtyping import Float
 
 from ipjax.capture.models.finishing import close_bottom, drop_loose, frame_model, stand
 from ipjax.capture.models.frames import PosedFrame, lift
-from ipjax.capture.models.separation import Hint, separate
+from ipjax.capture.models.separation import Hint, find_frame, separate
 from ipjax.capture.models.splitting import Seams
-from ipjax.capture.models.support import Support, find_support
+from ipjax.capture.models.support import Support, find_support, find_support_at
 from ipjax.capture.models.surfaces import count_views, cut, extract
 from ipjax.capture.models.symmetries import Symmetries, find_symmetries
 from ipjax.capture.models.volume import choose_blocks, fuse
@@ -75,6 +75,7 @@ def make_models(
     hints: Sequence[Hint] = (),
     config: ModelConfig | None = None,
     *,
+    support_at: Hint | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> SceneModels:
     """Models of the objects of a capture and of the whole scene.
@@ -82,18 +83,21 @@ def make_models(
     Args:
       frames: with their poses and depth.
       hints: which objects there are, as far as a person says so.
+      support_at: a pixel of what the objects stand on; None = the largest plane that things stand on.
       progress: called as ``progress(part, done, total)``.
 
     Raises:
       CaptureError: no support is found, or nothing that stands on it, or a hint is wrong.
     """
-    return make_objects(fuse_scene(frames, config, progress=progress), frames, hints, config, progress=progress)
+    fused = fuse_scene(frames, config, support_at=support_at, progress=progress)
+    return make_objects(fused, frames, hints, config, progress=progress)
 
 
 def fuse_scene(
     frames: Sequence[PosedFrame],
     config: ModelConfig | None = None,
     *,
+    support_at: Hint | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> FusedScene:
     """The first part of `make_models`: the support, and everything in one surface.
@@ -104,7 +108,10 @@ def fuse_scene(
     config = config or ModelConfig()
     tell = lambda part: None if progress is None else lambda done, total: progress(part, done, total)
     points = np.concatenate([lift(frame, _STEP)[0] for frame in frames])
-    support = find_support(frames, points)
+    if support_at is None:
+        support = find_support(frames, points)
+    else:
+        support = find_support_at(find_frame(frames, support_at), support_at.x, support_at.y, points)
     gains = balance(frames, support.support_from_world)
     above = _lift_above(frames, support, config)
     blocks = choose_blocks(above, config.voxel, support.axes)

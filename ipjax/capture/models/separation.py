@@ -158,9 +158,7 @@ def _name_freely(taken: set[str]) -> str:
 
 def _place_hint(hint: Hint, frames: Sequence[PosedFrame], mesh: Mesh, allowed: np.ndarray) -> Int[np.ndarray, " k"]:
     """Vertices that a hint surely means."""
-    frame = frames[0] if hint.frame is None else next((f for f in frames if f.name == hint.frame), None)
-    if frame is None:
-        raise CaptureError(f"{hint.name}: no frame with a pose is called {hint.frame}")
+    frame = find_frame(frames, hint)
     seen, pixels = _see(frame, mesh)
     seen &= allowed
     if hint.right is not None and hint.bottom is not None:
@@ -188,6 +186,18 @@ def _place_hint(hint: Hint, frames: Sequence[PosedFrame], mesh: Mesh, allowed: n
             "anything that stands on the support"
         )
     return np.flatnonzero(distance < max(_SEED, distance.min() + 0.002))
+
+
+def find_frame(frames: Sequence[PosedFrame], hint: Hint) -> PosedFrame:
+    """The frame that a hint is about.
+
+    Raises:
+      CaptureError: no frame with a pose has its name.
+    """
+    frame = frames[0] if hint.frame is None else next((f for f in frames if f.name == hint.frame), None)
+    if frame is None:
+        raise CaptureError(f"{hint.name}: no frame with a pose is called {hint.frame}")
+    return frame
 
 
 def _see(frame: PosedFrame, mesh: Mesh) -> tuple[np.ndarray, Float[np.ndarray, "n 2"]]:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ipjax.cameras import unproject
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.records import CaptureError
 from ipjax.detection.proposals.planes import find_planes
@@ -18,6 +19,7 @@ _WIDTH = 160  # of the images that they are sought in
 _TOLERANCE = 0.006  # metres at 1 m
 _LEAST = 0.08  # of a frame that a support covers
 _NEAR = 0.005  # metres of a plane within which a point votes for it
+_CLICKED = 0.02  # of the image's width, on every side of a clicked pixel, that lies on the clicked plane
 _CELL = 0.01  # metres: of the map of what the plane covers
 
 
@@ -86,6 +88,45 @@ def find_support(frames: Sequence[PosedFrame], points: Float[np.ndarray, "n 3"],
     plane = _fit(best, points)
     if np.median(eyes @ plane[:3] + plane[3]) < 0:
         plane = -plane
+    return _describe(plane, points)
+
+
+def find_support_at(frame: PosedFrame, x: float | int, y: float | int, points: Float[np.ndarray, "n 3"]) -> Support:
+    """The plane that a person clicked, in a frame.
+
+    Args:
+      x, y: pixels.
+      points: of all frames in world, to which it is fitted.
+
+    Raises:
+      CaptureError: there is no depth about the pixel, or no plane.
+    """
+    width, height = frame.size
+    reach = max(round(_CLICKED * width), 3)
+    column, row = round(x), round(y)
+    if not (0 <= column < width and 0 <= row < height):
+        raise CaptureError(f"the click ({x:g}, {y:g}) on the support is outside of {width} × {height} pixels")
+    rows, columns = np.mgrid[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1]
+    inside = (rows < height) & (columns < width)
+    rows, columns = rows[inside], columns[inside]
+    known = (frame.depth[rows, columns] > 0) & frame.usable[rows, columns]
+    rows, columns = rows[known], columns[known]
+    if len(rows) < 20:
+        raise CaptureError(f"frame {frame.name} has no depth about ({x:g}, {y:g}), where the support was clicked")
+    pixels = np.stack([columns, rows], -1).astype(np.float64)
+    near = frame.world_from_camera @ unproject(frame.camera, pixels, frame.depth[rows, columns].astype(np.float64))
+    middle = np.median(near, axis=0)
+    _, vectors = np.linalg.eigh((near - middle).T @ (near - middle))
+    normal = vectors[:, 0]
+    # What is farther away is asked only once the plane is known well enough to reach there.
+    plane = np.append(normal, -normal @ middle)
+    for share in (0.1, 0.2, 0.4):
+        plane = _fit(plane, points[np.linalg.norm(points - middle, axis=-1) < share])
+    plane = _fit(plane, points)
+    if frame.world_from_camera.translation @ plane[:3] + plane[3] < 0:
+        plane = -plane
+    if (np.abs(points @ plane[:3] + plane[3]) < _NEAR).sum() < 100:
+        raise CaptureError(f"there is no plane about ({x:g}, {y:g}) in frame {frame.name}")
     return _describe(plane, points)
 
 

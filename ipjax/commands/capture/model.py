@@ -20,7 +20,8 @@ examples:
   ipjax capture model table/ -o work/ --box mug:280,160,70,90 --voxel 1.5 --close
 
 Objects are what stands on the table, apart from one another. Those that touch are told apart by the creases between
-them, or by a click (or a box) on each in one frame: NAME:X,Y, or NAME:X,Y@FRAME where it is not the first.
+them, or by a click (or a box) on each in one frame: NAME:X,Y, or NAME:X,Y@FRAME where it is not the first. Where
+something else than the table is taken for what they stand on, as the front of a large box may be, --support X,Y tells.
 
 Reads WORK/refined.json or WORK/poses.json, and WORK/depth/, if the step depth made it. Writes WORK/models/: NAME.ply
 and NAME_points.ply of each object, scene.ply and scene_points.ply, models.json; and the picture WORK/models.png.
@@ -37,6 +38,7 @@ def add(steps: Any) -> None:
     options.add_output(parser, "WORK", "folder of what the steps make", required=True)
     parser.add_argument("--click", action="append", type=_parse_click, metavar="NAME:X,Y", help="an object, by a pixel")
     parser.add_argument("--box", action="append", type=_parse_box, metavar="NAME:X,Y,W,H", help="an object, by a box")
+    parser.add_argument("--support", type=_parse_pixel, metavar="X,Y", help="a pixel of what they stand on")
     parser.add_argument("--voxel", type=float, default=2.0, metavar="MM", help="of the objects (default 2)")
     parser.add_argument("--close", action="store_true", help="close the bottoms, on which the objects stand")
     parser.add_argument("--together", action="store_true", help="do not divide what touches without being told")
@@ -71,7 +73,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         close=arguments.close,
         colour_symmetries=not arguments.shape_symmetries,
     )
-    made_of = describe_inputs(arguments, work, {"config": repr(config), "hints": repr(hints)})
+    made_of = describe_inputs(arguments, work, {"config": repr(config), "hints": repr([*hints, arguments.support])})
     folder = work / "models"
     if read_made_of(folder) == made_of and not arguments.again:
         messages.say(f"{folder} was made of the same already; --again makes it once more.")
@@ -79,7 +81,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         return 0
     use_compilation_cache()
     with Bars(quiet=arguments.quiet) as bars:
-        found = make_models(frames, hints, config, progress=bars.show)
+        found = make_models(frames, hints, config, support_at=arguments.support, progress=bars.show)
     write_models(folder, found, made_of)
     write_image(work / "models.png", draw_models(found.objects))
     for line in found.notes:
@@ -144,6 +146,13 @@ def _parse_click(text: str) -> Any:
 
 def _parse_box(text: str) -> Any:
     return _parse_hint(text, 4, "NAME:X,Y,W,H, for instance mug:280,160,70,90 or mug:280,160,70,90@000007")
+
+
+def _parse_pixel(text: str) -> Any:
+    try:
+        return _parse_click(f"support:{text}")
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no pixel: give X,Y or X,Y@FRAME") from None
 
 
 def _parse_hint(text: str, count: int, form: str) -> Any:
