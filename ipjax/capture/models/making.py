@@ -27,7 +27,8 @@ class ModelConfig:
     """Settings of `make_models`; metres."""
 
     voxel: float = 0.002
-    reach: float | None = None  # that a frame speaks of behind what it sees; None = 2.5 voxels
+    # That a frame speaks of behind what it sees; None = 2.5 voxels, or four times what depth is off on the support.
+    reach: float | None = None
     cut: float = 0.003  # above the support, below which the surface is the support's
     tallest: float = 0.5  # above the support, of an object
     least_area: float = 1e-3  # metres², of an object's measured surface
@@ -115,16 +116,16 @@ def fuse_scene(
     gains = balance(frames, support.support_from_world)
     above = _lift_above(frames, support, config)
     blocks = choose_blocks(above, config.voxel, support.axes)
-    volume = fuse(
-        frames, blocks, config.voxel, support.axes, reach=config.reach, gains=gains, progress=tell("fusing objects")
-    )
-    middle, reach = np.median(above, axis=0), config.scene_around
-    near = points[np.linalg.norm(points - middle, axis=-1) < reach]
+    # Less leaves holes where frames disagree by more; more makes edges and thin things thicker.
+    reach = config.reach or max(2.5 * config.voxel, 4 * support.spread)
+    volume = fuse(frames, blocks, config.voxel, support.axes, reach=reach, gains=gains, progress=tell("fusing objects"))
+    middle = np.median(above, axis=0)
+    near = points[np.linalg.norm(points - middle, axis=-1) < config.scene_around]
     wide = choose_blocks(near, config.scene_voxel, support.axes)
     scene = fuse(frames, wide, config.scene_voxel, support.axes, gains=gains, progress=tell("fusing the scene"))
     surface = extract(volume)
     # What no two frames saw from its front is where the space behind edges ends, no surface.
-    seen = count_views(surface, frames, near=2 * config.voxel) >= min(2, len(frames))
+    seen = count_views(surface, frames, near=0.8 * reach) >= min(2, len(frames))
     if not seen[surface.faces].all(1).any():
         raise CaptureError("no surface was found: the frames do not agree on any")
     surface = cut(surface, seen[surface.faces].all(1))
