@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import ConvexHull, cKDTree
 
 from ipjax.cameras import project, unproject
 from ipjax.capture.models.frames import PosedFrame
@@ -21,6 +21,8 @@ _HIDDEN = 0.01  # metres behind what a frame measured, at which it does not see 
 _FOOT = 0.01  # metres above the support: what is lower is where a thing stands
 _STANDS = 0.02  # metres above the support, below which a piece begins that is a thing by itself
 _APART = 0.03  # metres between pieces of one thing, where what is between them was not seen
+_INNER = 0.25  # of a piece's area, below which another under it is a part of it
+_WITHIN = 0.7  # of its points
 _BESIDE = 0.006  # … and between a thing and a small piece that belongs to it
 
 
@@ -87,6 +89,7 @@ def separate(
     stands[meant] = True
     if not stands.any():
         stands = large
+    stands &= ~_find_inner(support.support_from_world @ rest.vertices, piece, area, stands, meant)
     # Of every vertex the number of its object: hints first, then what is found without.
     owner, count = np.full(len(rest.vertices), -1), len(hints)
     for number in np.flatnonzero(stands):
@@ -131,6 +134,34 @@ def _cut_off(surface: Mesh, support: Support, cut_at: float) -> Mesh:
     if not keep.any():
         raise CaptureError("nothing stands on the support: no surface rises above the table")
     return cut(surface, keep)
+
+
+def _find_inner(
+    points: Float[np.ndarray, "n 3"],
+    piece: Int[np.ndarray, " n"],
+    area: Float[np.ndarray, " p"],
+    stands: Bool[np.ndarray, " p"],
+    meant: Int[np.ndarray, " _"],
+) -> Bool[np.ndarray, " p"]:
+    """Pieces that are most probably of a larger one, because they are small and under it: a part of its underside.
+
+    Args:
+      points: x, y and height on the support.
+      meant: pieces that a hint says are things.
+    """
+    inner = np.zeros(len(area), bool)
+    order = np.flatnonzero(stands)[np.argsort(-area[stands], kind="stable")]
+    for larger in order:
+        smaller = [k for k in order if area[k] < _INNER * area[larger] and not inner[k] and k not in meant]
+        if inner[larger] or not smaller:
+            continue
+        above = points[piece == larger]
+        sides = ConvexHull(above[:, :2]).equations
+        for k in smaller:
+            mine = points[piece == k]
+            covered = (mine[:, :2] @ sides[:, :2].T + sides[:, 2]).max(1) < _BESIDE
+            inner[k] = (covered & (mine[:, 2] < above[:, 2].max())).mean() > _WITHIN
+    return inner
 
 
 def _attach(

@@ -16,6 +16,7 @@ from scipy.sparse.linalg import eigsh, splu
 
 from ipjax.files.meshes.mesh import Mesh, corner_products, unit
 
+_HALF = 0.3  # of a surface: a side with more is no handle, even if its foot was not seen
 _FOOT = 5e-5  # metres² near the support that a thing which stands there has
 
 
@@ -127,7 +128,8 @@ def split_alone(
 
     A part is cut in two where that costs least: the cut's length, each bit by its weight, over the square root of the
     smaller side's area (1.9 for a cube cut in half, however large). Cuts are sought along the first eigenvectors of the
-    graph (Shi and Malik 2000). What does not stand on the support by itself is a handle or a lid and stays.
+    graph (Shi and Malik 2000). A small side that
+    does not stand on the support by itself is a handle or a lid, and stays.
 
     Args:
       stands: vertices at the foot of the surface.
@@ -185,7 +187,7 @@ def _halve(
         smaller = np.minimum(area, area[-1] - area)
         foot = np.cumsum(stands[order] * part.area[order])
         smaller_foot = np.minimum(foot, foot[-1] - foot)
-        good = (smaller > least_area) & (smaller_foot > _FOOT)
+        good = (smaller > least_area) & ((smaller_foot > _FOOT) | (smaller > _HALF * area[-1]))
         ratio = np.where(good, running / np.sqrt(np.maximum(smaller, 1e-12)), np.inf)
         at = int(ratio.argmin())
         if ratio[at] < best_cost:
