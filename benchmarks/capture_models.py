@@ -231,8 +231,8 @@ def measure_open3d(
     return found
 
 
-def write_page(results: list[dict[str, Any]], command: str) -> str:
-    """The page."""
+def write_page(results: list[dict[str, Any]], beside: list[dict[str, Any]], command: str) -> str:
+    """The page; ``beside``: captures from which Open3D's figures are taken."""
     device = describe_device()
     root = Path(__file__).resolve().parent.parent
     state = subprocess.run(["git", "rev-parse", "--short=10", "HEAD"], cwd=root, capture_output=True, text=True)
@@ -246,7 +246,7 @@ def write_page(results: list[dict[str, Any]], command: str) -> str:
         f"Seeds {seeds}. Every capture: five objects of 0.12 to 0.22 m on a table, one pair touching (two pairs "
         "in odd seeds), the others 3 cm apart or more; 24 frames of 640 × 480 with noise, frayed edges and holes; "
         f"true poses off by {1000 * SHIFT:g} mm and {TURN:g}° (rms); raw depth warped by the true rig. Settings were "
-        "chosen on seeds 100 to 103.",
+        "chosen on others (100 to 102).",
         "",
         "`alone`: nothing is said; `clicks`: one click on each object, all in one frame.",
         "",
@@ -312,12 +312,13 @@ def write_page(results: list[dict[str, Any]], command: str) -> str:
         + " |",
         "",
     ]
-    compared = [item[OPEN3D] for item in results if OPEN3D in item]
+    compared = [item[OPEN3D] for item in beside if OPEN3D in item]
     if compared:
         lines += [
             "## Beside Open3D's VoxelBlockGrid (2 mm voxels, the same trusted pixels)",
             "",
-            "Both surfaces, before objects are told apart, against all true objects, above 3 mm of the table.",
+            "Both surfaces, before objects are told apart, against all true objects, above 3 mm of the table. Seeds: "
+            f"{', '.join(str(item['seed']) for item in beside if OPEN3D in item)}, on which settings were chosen.",
             "",
             "| | median, mm | 90 %, mm | signed mean, mm | farther than 5 mm |",
             "|---|---:|---:|---:|---:|",
@@ -353,6 +354,7 @@ def main() -> None:
     measure.add_argument("--open3d", action="store_true", help="beside Open3D, which must be installed")
     page = steps.add_parser("page", help="the page of what was measured")
     page.add_argument("results", type=Path, nargs="+", metavar="JSONL")
+    page.add_argument("--beside", type=Path, nargs="*", default=[], metavar="JSONL", help="measured with --open3d")
     page.add_argument("--page", type=Path)
     options = parser.parse_args()
     if options.step == "measure":
@@ -364,10 +366,12 @@ def main() -> None:
                 file.write(json.dumps(found) + "\n")
             print(f"seed {seed}: {found['cpu_seconds']}", file=sys.stderr, flush=True)
         return
-    results = [json.loads(line) for path in options.results for line in path.read_text().splitlines()]
-    results = sorted(results, key=lambda item: item["seed"])
+    read = lambda paths: sorted(
+        (json.loads(line) for path in paths for line in path.read_text().splitlines()), key=lambda item: item["seed"]
+    )
+    results = read(options.results)
     seeds = " ".join(str(item["seed"]) for item in results)
-    text = write_page(results, f"python -m benchmarks.capture_models measure {seeds}")
+    text = write_page(results, read(options.beside), f"python -m benchmarks.capture_models measure {seeds}")
     print(text)
     if options.page:
         write_text(options.page, text)
