@@ -104,13 +104,13 @@ def separate(
             names = np.array([k for k, _ in here])
         else:
             label = np.zeros(len(mesh.vertices), int)
-            if alone:
+            if alone and not here:  # what a person says is one thing is one
                 near = support.heights(mesh.vertices) < _FOOT
                 label = split_alone(make_affinity(mesh, seams), near, least_area=least_area)
             names = count + np.arange(label.max() + 1)
             count += len(names)
             if here:
-                names[np.bincount(label[here[0][1]]).argmax()] = here[0][0]
+                names[0] = here[0][0]
         owner[mine] = names[label]
     owner = _attach(rest, piece, owner, np.where(large, _APART, _BESIDE))
     faces_of = np.median(owner[rest.faces], axis=1).astype(int)  # of two corners or three
