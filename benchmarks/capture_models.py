@@ -16,7 +16,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from benchmarks.measure import describe_device
 from ipjax.capture.labels.masks import find_box, label_frames
@@ -38,7 +38,7 @@ def make_frames(seed: int, views: int, size: tuple[int, int], exact: bool) -> tu
     step = np.concatenate(
         [rng.normal(0, np.deg2rad(TURN / 3**0.5), (views, 3)), rng.normal(0, SHIFT / 3**0.5, (views, 3))], -1
     )
-    poses = made.world_from_camera @ Similarity.exp(0 * step if exact else step)
+    poses = made.world_from_camera @ Similarity[np.ndarray].exp(0 * step if exact else step)
     frames = []
     for index, name in enumerate(made.names):
         depth = register_depth(made.raw_depth[index], made.depth_camera, made.colour_from_depth, made.camera, size)
@@ -155,7 +155,7 @@ def signed_distances(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray
     chosen = rng.choice(len(faces), 60000, p=area / area.sum())
     root, share = np.sqrt(rng.uniform(size=60000)), rng.uniform(size=60000)
     weights = np.stack([1 - root, root * (1 - share), root * share], -1)
-    near = chosen[cKDTree((corners[chosen] * weights[..., None]).sum(1)).query(points, 4)[1]]
+    near = chosen[KDTree((corners[chosen] * weights[..., None]).sum(1)).query(points, 4)[1]]
     best, signed = np.full(len(points), np.inf), np.zeros(len(points))
     for column in near.T:
         away = points - closest_point(corners[column], points)
@@ -343,7 +343,7 @@ def mean_error(values: Any) -> str:
 
 def main() -> None:
     """Measure seeds, or write the page of what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     steps = parser.add_subparsers(dest="step", required=True)
     measure = steps.add_parser("measure", help="measure seeds; a line of JSON each")
     measure.add_argument("seeds", type=int, nargs="+")

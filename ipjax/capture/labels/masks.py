@@ -98,7 +98,7 @@ def _label_batch(
     alone = render_each(
         [model.mesh for model in models],
         list(range(len(models))) * len(frames),
-        _stack([pose for row in poses for pose in row]),
+        _stack([pose for row in poses for pose in row]).to_jax(),
         wide,
         height + 2 * rim[1],
         width + 2 * rim[0],

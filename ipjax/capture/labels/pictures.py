@@ -62,7 +62,7 @@ def draw_models(models: Sequence[ObjectModel], *, backend: str = "auto") -> UInt
             np.concatenate([pose.rotation for pose in poses]),
             np.concatenate([pose.translation for pose in poses]),
             np.ones(len(meshes) * len(directions)),
-        ),
+        ).to_jax(),
         camera,
         side,
         side,

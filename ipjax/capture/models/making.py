@@ -107,7 +107,10 @@ def fuse_scene(
       CaptureError: no support is found, or nothing is above it.
     """
     config = config or ModelConfig()
-    tell = lambda part: None if progress is None else lambda done, total: progress(part, done, total)
+
+    def tell(part: str) -> Callable[[int, int], None]:
+        return lambda done, total: None if progress is None else progress(part, done, total)
+
     points = np.concatenate([lift(frame, _STEP)[0] for frame in frames])
     if support_at is None:
         support = find_support(frames, points)
@@ -126,9 +129,10 @@ def fuse_scene(
     surface = extract(volume)
     # What no two frames saw from its front is where the space behind edges ends, no surface.
     seen = count_views(surface, frames, near=0.8 * reach) >= min(2, len(frames))
-    if not seen[surface.faces].all(1).any():
+    keep = np.asarray(seen[surface.faces].all(1))
+    if not keep.any():
         raise CaptureError("no surface was found: the frames do not agree on any")
-    surface = cut(surface, seen[surface.faces].all(1))
+    surface = cut(surface, keep)
     return FusedScene(surface, drop_loose(extract(scene), 0.002), support, gains)
 
 

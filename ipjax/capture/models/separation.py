@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from ipjax.cameras import project, unproject
 from ipjax.capture.models.frames import PosedFrame
@@ -83,7 +83,7 @@ def separate(
     large = (area > least_area) & (top > least_height)
     if not large.any():
         raise CaptureError("nothing that stands on the support is large enough to be an object")
-    seeds = [_place_hint(hint, frames, rest, large[piece]) for hint in hints]
+    seeds = [_place_hint(hint, frames, rest, np.asarray(large[piece])) for hint in hints]
     meant = np.unique(np.concatenate([piece[seed] for seed in seeds])) if seeds else np.zeros(0, int)
     stands = large & (foot < _STANDS)
     stands[meant] = True
@@ -130,7 +130,7 @@ def separate(
 def _cut_off(surface: Mesh, support: Support, cut_at: float) -> Mesh:
     """What of a surface is above the support and over what was seen of it."""
     inside = (support.heights(surface.vertices) > cut_at) & support.covers(surface.vertices)
-    keep = inside[surface.faces].all(1)
+    keep = np.asarray(inside[surface.faces].all(1))
     if not keep.any():
         raise CaptureError("nothing stands on the support: no surface rises above the table")
     return cut(surface, keep)
@@ -172,7 +172,7 @@ def _attach(
     loose = np.flatnonzero(~known)
     if not len(loose) or not known.any():
         return owner
-    distance, nearest = cKDTree(mesh.vertices[known]).query(mesh.vertices[loose])
+    distance, nearest = KDTree(mesh.vertices[known]).query(mesh.vertices[loose])
     first = np.full(len(within), np.inf)
     np.minimum.at(first, piece[loose], distance)
     owner = owner.copy()

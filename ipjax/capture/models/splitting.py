@@ -172,7 +172,7 @@ def _halve(
     mass = sparse.diags(part.area + 1e-12)
     start = np.random.default_rng(0).normal(size=part.count)
     scale = float(part.weight.mean() / part.area.mean())
-    values, found = eigsh(part.laplacian(), k=vectors + 1, M=mass, sigma=-1e-3 * scale, which="LM", v0=start, tol=1e-2)
+    values, found = eigsh(part.laplacian(), k=vectors + 1, M=mass, sigma=-1e-3 * scale, which="LM", v0=start, tol=1e-2)  # pyright: ignore[reportArgumentType]
     a, b = part.edges.T
     best, best_cost = None, loosest
     for vector in found.T[np.argsort(values)][1:]:

@@ -114,7 +114,7 @@ def _read(folder: Path) -> dict[str, Any]:
 
 
 def _parse(folder: Path, entry: dict[str, Any]) -> ObjectModel:
-    pose = Similarity.from_matrix(np.asarray(entry["world_from_model"], np.float64))
+    pose = Similarity[np.ndarray].from_matrix(np.asarray(entry["world_from_model"], np.float64))
     symmetries = Symmetries(
         tuple(np.asarray(matrix, np.float64).reshape(4, 4) for matrix in entry["symmetries_discrete"]),
         tuple(

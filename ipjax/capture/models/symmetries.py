@@ -5,7 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ipjax.capture.models.finishing import find_rim
 from ipjax.files.meshes.mesh import Mesh, corner_products
@@ -53,9 +53,9 @@ def find_symmetries(
     """
     rng = np.random.default_rng(seed)
     points, lab = _sample(mesh, rng, 8 * _POINTS)
-    tree = cKDTree(points)
+    tree = KDTree(points)
     rim = find_rim(mesh.faces)
-    holes = cKDTree(mesh.vertices[np.unique(rim)]) if len(rim) else None
+    holes = KDTree(mesh.vertices[np.unique(rim)]) if len(rim) else None
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     allowed = max(tolerance, relative * size)
     # The middle of the box is where an axis of symmetry must go through; noise at its ends moves it, so it is bettered.
@@ -78,7 +78,7 @@ def find_symmetries(
         if colour is None:
             return True
         close = asked & (distance < allowed)
-        return float(np.median(np.linalg.norm(lab[picked][close] - lab[index[close]], axis=-1))) < colour
+        return float(np.median(np.linalg.norm(lab[picked][close] - lab[np.asarray(index)[close]], axis=-1))) < colour
 
     axes = np.eye(3)
     is_round = [all(holds(a, 2 * np.pi * k / _ROUND) for k in (1, 5, 7, 12, 17)) for a in axes]

@@ -40,7 +40,7 @@ class Volume:
         occupied = np.zeros(np.ptp(self.blocks, axis=0) + 1, bool)
         places = tuple((self.blocks - low).T)
         occupied[places] = True
-        labels, count = ndimage.label(occupied, np.ones((3, 3, 3)))
+        labels, count = ndimage.label(occupied, np.ones((3, 3, 3)))  # pyright: ignore
         return [labels[places] == number for number in range(1, count + 1)]
 
     def dense(self, chosen: Bool[np.ndarray, " b"]) -> tuple[Int[np.ndarray, "3"], np.ndarray, np.ndarray, np.ndarray]:
