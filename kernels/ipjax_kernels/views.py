@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ipjax_kernels.positive import root
-from ipjax_kernels.rasterize import splat_colours, splat_depth
+from ipjax_kernels.rasterize import splat_depth
 
 
 class Sources(NamedTuple):
@@ -64,7 +64,7 @@ def draw_view(
 ) -> Drawn:
     """The image and the depth that a camera sees, height × width pixels. Vmap over views.
 
-    Time: 3 k splats of the sources' pixels and 2 k² + 5 k look-ups a pixel; memory: O(k (h w + height · width)).
+    Time: 3 k splats of the sources' pixels and 2 k² + 7 k look-ups a pixel; memory: O(k (h w + height · width)).
     """
     rays = _rays(height, width, focal, centre)
 
@@ -72,7 +72,10 @@ def draw_view(
         """A source's guesses, put where the view's rays meet what it measured: splats are of whole pixels."""
         alone = sources._replace(**{name: part[None] for name, part in zip(_OF_EACH, one, strict=True)})
         carried = _carry(*one, sources, focal, centre, height, width)
-        return jax.vmap(lambda z: jnp.where(z > 0, _look(z, rays, alone, rules, focal).depth[0], 0))(carried)
+        for _ in range(_REFINEMENTS):
+            meet = lambda z: jnp.where(z > 0, _look(z, rays, alone, rules, focal).depth[0], 0)
+            carried = jax.vmap(meet)(carried)
+        return carried
 
     guesses = jax.vmap(guess)(*(getattr(sources, name) for name in _OF_EACH))
 
@@ -163,21 +166,18 @@ def _carry(
     width: int,
 ) -> Float[Array, "2 a b"]:
     """A source's depth in the view, 0 where none of its points falls: the nearest of the pixel's own points, and the
-    surface before it that points of the pixels around belong to. Where points lie apart, half the resolution fills in.
+    nearest of those of the 3 × 3 pixels around. Where points lie apart, half the resolution fills in.
     """
     rows, columns = depth.shape
     points = (_rays(rows, columns, sources.focal, sources.centre) * depth[..., None]).reshape(-1, 3)
     points = jnp.sum(rotation.T[None] * (points - translation)[:, None, :], axis=-1)
     valid = (depth.reshape(-1) > 0) & (weight > 0)
-    z = points[:, 2:]
-    behind = jnp.asarray(0.01, depth.dtype)
-    fine, _ = splat_colours(points, z, valid, focal, centre, height, width, behind)
+    own, around = (splat_depth(points, valid, focal, centre, height, width, radius=r) for r in (0, 1))
     # Every second pixel of the view: pixel i of it is 2 i of the view.
     few = (height + 1) // 2 + 1, (width + 1) // 2 + 1
-    coarse, _ = splat_colours(points, z, valid, focal / 2, centre / 2, *few, behind)
+    coarse = splat_depth(points, valid, focal / 2, centre / 2, *few, radius=1)
     row, column = (jnp.arange(height) + 1) // 2, (jnp.arange(width) + 1) // 2
-    around = jnp.where(fine[..., 0] > 0, fine[..., 0], coarse[row[:, None], column, 0])
-    return jnp.stack([splat_depth(points, valid, focal, centre, height, width, radius=0), around])
+    return jnp.stack([own, jnp.where(around > 0, around, coarse[row[:, None], column])])
 
 
 def _rays(height: int, width: int, focal: Float[Array, "2"], centre: Float[Array, "2"]) -> Float[Array, "h w 3"]:

@@ -55,8 +55,9 @@ def draw_view(sources, rules, focal, centre, height, width):
                 guess = carried[row, column]
                 if guess <= 0:
                     continue
-                own = look(guess)[k]
-                guess = guess if own is None else own[4]
+                for _ in range(2):
+                    own = look(guess)[k]
+                    guess = guess if own is None or guess <= 0 else own[4]
                 if guess <= 0:
                     continue
                 total = sum(one[1] * (one[2] - one[3]) for one in look(guess) if one is not None)
@@ -89,50 +90,23 @@ def _carry(depth, rotation, translation, own_focal, own_centre, focal, centre, h
     for row, column in zip(*np.nonzero(depth > 0), strict=True):
         ray = np.array([*((np.array([column, row]) - own_centre) / own_focal), 1.0])
         points.append(rotation.T @ (depth[row, column] * ray - translation))
-    own = np.zeros((height, width))
-    for place, inside in _collect(points, focal, centre, height, width).items():
-        own[place] = min(inside)
-    fine = _splat(points, focal, centre, height, width)
-    coarse = _splat(points, focal / 2, centre / 2, (height + 1) // 2 + 1, (width + 1) // 2 + 1)
-    for row, column in zip(*np.nonzero(fine == 0), strict=True):
-        fine[row, column] = coarse[(row + 1) // 2, (column + 1) // 2]
-    return own, fine
+    own, around = (_splat(points, focal, centre, height, width, radius) for radius in (0, 1))
+    coarse = _splat(points, focal / 2, centre / 2, (height + 1) // 2 + 1, (width + 1) // 2 + 1, 1)
+    for row, column in zip(*np.nonzero(around == 0), strict=True):
+        around[row, column] = coarse[(row + 1) // 2, (column + 1) // 2]
+    return own, around
 
 
-def _collect(points, focal, centre, height, width, rim=0):
-    """The depths of the points in each pixel, (row, column); also of a rim around the image."""
-    cells = {}
+def _splat(points, focal, centre, height, width, radius):
+    """The nearest of the points in the pixels around each."""
+    image = np.full((height, width), np.inf)
     for point in points:
         if point[2] > 0:
             column, row = np.round(focal * point[:2] / point[2] + centre).astype(int)
-            if -rim <= row < height + rim and -rim <= column < width + rim:
-                cells.setdefault((row, column), []).append(point[2])
-    return cells
-
-
-def _splat(points, focal, centre, height, width, behind=0.01):
-    """Depths of points: the mean of those near the nearest of the 3 × 3 pixels around, of the pixel itself if it has
-    any.
-    """
-    cells = _collect(points, focal, centre, height, width, rim=1)
-
-    def around(row, column):
-        return [z for i in (-1, 0, 1) for j in (-1, 0, 1) for z in cells.get((row + i, column + j), ())]
-
-    shown = {}
-    for place, inside in cells.items():
-        if 0 <= place[0] < height and 0 <= place[1] < width:
-            shown[place] = [z for z in inside if z <= min(around(*place)) + behind]
-    image = np.zeros((height, width))
-    for row in range(height):
-        for column in range(width):
-            if not around(row, column):
-                continue
-            chosen = shown.get((row, column)) or [
-                z for i in (-1, 0, 1) for j in (-1, 0, 1) for z in shown.get((row + i, column + j), ())
-            ]
-            image[row, column] = np.mean(chosen) if chosen else 0
-    return image
+            for i in range(max(row - radius, 0), min(row + radius + 1, height)):
+                for j in range(max(column - radius, 0), min(column + radius + 1, width)):
+                    image[i, j] = min(image[i, j], point[2])
+    return np.where(np.isfinite(image), image, 0)
 
 
 def _corners(pixel, height, width):
