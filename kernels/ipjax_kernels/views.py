@@ -72,10 +72,8 @@ def draw_view(
         """A source's guesses, put where the view's rays meet what it measured: splats are of whole pixels."""
         alone = sources._replace(**{name: part[None] for name, part in zip(_OF_EACH, one, strict=True)})
         carried = _carry(*one, sources, focal, centre, height, width)
-        for _ in range(_REFINEMENTS):
-            meet = lambda z: jnp.where(z > 0, _look(z, rays, alone, rules, focal).depth[0], 0)
-            carried = jax.vmap(meet)(carried)
-        return carried
+        meet = jax.vmap(lambda z: jnp.where(z > 0, _look(z, rays, alone, rules, focal).depth[0], 0))
+        return lax.fori_loop(0, _REFINEMENTS, lambda _, z: meet(z), carried)
 
     guesses = jax.vmap(guess)(*(getattr(sources, name) for name in _OF_EACH))
 
@@ -90,13 +88,15 @@ def draw_view(
 
     nothing = jnp.zeros((height, width), sources.depth.dtype)
     (depth, _), _ = lax.scan(judge, (nothing, nothing), guesses.reshape(-1, height, width))
-    for _ in range(_REFINEMENTS):
+
+    def refine(_, depth):
         seen = _look(depth, rays, sources, rules, focal)
         weight = seen.weight * seen.agrees
         total = jnp.sum(weight, axis=0)
         moved = jnp.sum(weight * seen.depth, axis=0) / jnp.where(total > 0, total, 1)
-        depth = jnp.where(total > 0, moved, depth)
+        return jnp.where(total > 0, moved, depth)
 
+    depth = lax.fori_loop(0, _REFINEMENTS, refine, depth)
     seen = _look(depth, rays, sources, rules, focal)
     steady = jax.vmap(lambda z: _find_jumps(z, rules.tolerance))(sources.depth)
     beside = jax.vmap(_nearest)(steady.astype(depth.dtype), seen.pixel)

@@ -47,34 +47,33 @@ def as_sources(seen, view, weights):
     return Sources(*(jnp.asarray(part, jnp.float32) for part in parts))
 
 
-def test_as_pixel_by_pixel():
-    rng = np.random.default_rng(0)
-    sources = as_sources(look([-0.3, 0.1, 0.4], rng), look([0.0]), np.array([1.0, 0.7, 0.2]))
-    with jax.enable_x64(True):
-        exact = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), sources)
-        focal, centre = FOCAL.astype(jnp.float64) * 1.7, CENTRE.astype(jnp.float64)
-        drawn = draw_view(exact, RULES, focal, centre, HEIGHT, WIDTH)
-        colours, depth, support = reference.draw_view(exact, RULES, focal, centre, HEIGHT, WIDTH)
-        np.testing.assert_allclose(drawn.depth, depth, atol=1e-9)
-        np.testing.assert_allclose(drawn.support, support, atol=1e-9)
-        np.testing.assert_allclose(drawn.colours, colours, atol=1e-9)
-    assert (depth > 0).mean() > 0.8
-
-
 @pytest.fixture(scope="module")
 def drawn():
-    """Three views at once: from three frames, from one of which the others say nothing, and from none."""
+    """Four views at once: of three frames, of one about which the others are silent, of none, and of noisy ones."""
     view = look([0.05])
     seen, same = look([-0.3, 0.5, 0.7]), look([0.05, 0.2, 0.5])
     same[1][1:] = 0.5  # nonsense
-    weights = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 0]])
-    batch = [as_sources(frames, view, w) for frames, w in zip((seen, same, same), weights, strict=True)]
+    noisy = look([-0.3, 0.1, 0.4], np.random.default_rng(0))
+    batch = [
+        as_sources(frames, view, np.array(weights))
+        for frames, weights in ((seen, [1, 1, 1]), (same, [1, 0, 0]), (same, [0, 0, 0]), (noisy, [1, 0.7, 0.2]))
+    ]
     draw = jax.vmap(lambda sources: draw_view(sources, RULES, FOCAL, CENTRE, HEIGHT, WIDTH))
-    return view, jax.tree.map(np.asarray, draw(jax.tree.map(lambda *x: jnp.stack(x), *batch)))
+    return view, jax.tree.map(np.asarray, draw(jax.tree.map(lambda *x: jnp.stack(x), *batch))), batch[3]
+
+
+def test_as_pixel_by_pixel(drawn):
+    _, (colours, depth, support), sources = drawn
+    want_colours, want_depth, want_support = reference.draw_view(sources, RULES, FOCAL, CENTRE, HEIGHT, WIDTH)
+    # Where rounding decides which guess is taken, or whether a point is in a pixel, the two may differ.
+    same = np.abs(depth[3] - want_depth) < 1e-4
+    assert same.mean() > 0.99 and (want_depth > 0).mean() > 0.8
+    np.testing.assert_allclose(colours[3][same], want_colours[same], atol=2e-3)
+    np.testing.assert_allclose(support[3][same], want_support[same], atol=2e-3)
 
 
 def test_what_is_between_frames_is_drawn_and_the_rest_is_unknown(drawn):
-    view, (colours, depth, support) = drawn
+    view, (colours, depth, support), _ = drawn
     known = depth[0] > 0
     off = np.abs(depth[0] - view[1][0])[known]
     assert 0.9 < known.mean() < 1 and np.median(off) < 1e-3 and (off < 0.01).mean() > 0.95
@@ -84,7 +83,7 @@ def test_what_is_between_frames_is_drawn_and_the_rest_is_unknown(drawn):
 
 
 def test_a_source_without_weight_is_not_there(drawn):
-    view, (colours, depth, _) = drawn
+    view, (colours, depth, _), _ = drawn
     np.testing.assert_allclose(depth[1], view[1][0], rtol=1e-4)
     np.testing.assert_allclose(colours[1], view[0][0], atol=1e-4)
     assert (depth[2] == 0).all()
