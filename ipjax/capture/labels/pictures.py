@@ -26,7 +26,7 @@ def draw_labels(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """A sheet of frames, evenly picked, with outlines of what is visible, boxes and names."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(_MOST, len(frames))).round().astype(int))
-    return _sheet([_draw_frame(frames[int(i)], labels[int(i)], names) for i in chosen], 4)
+    return lay_out([_draw_frame(frames[int(i)], labels[int(i)], names) for i in chosen], 4)
 
 
 def _draw_frame(frame: PosedFrame, label: FrameLabels, names: Sequence[str]) -> np.ndarray:
@@ -43,8 +43,8 @@ def _draw_frame(frame: PosedFrame, label: FrameLabels, names: Sequence[str]) -> 
         if width > 0:
             cv2.rectangle(image, (x, y), (x + width, y + height), colour, 1)
             text = f"{names[index]} {100 * label.shares[index]:.0f} %"
-            _write(image, text, (x, max(y - 4, 10)), colour)
-    _write(image, frame.name, (4, size[1] - 6))
+            write_label(image, text, (x, max(y - 4, 10)), colour)
+    write_label(image, frame.name, (4, size[1] - 6))
     return image
 
 
@@ -74,9 +74,9 @@ def draw_models(models: Sequence[ObjectModel], *, backend: str = "auto") -> UInt
     for model, shown in zip(models, views, strict=True):
         tile = np.ascontiguousarray(shown.transpose(0, 2, 1, 3, 4).reshape(2 * side, len(directions) * side, 3))
         size = 1000 * np.ptp(model.mesh.vertices, axis=0)
-        _write(tile, f"{model.name}  {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} mm", (6, 16))
+        write_label(tile, f"{model.name}  {size[0]:.0f} x {size[1]:.0f} x {size[2]:.0f} mm", (6, 16))
         tiles.append(tile)
-    return _sheet(tiles, 2)
+    return lay_out(tiles, 2)
 
 
 def _as_shape(mesh: Mesh) -> Mesh:
@@ -98,7 +98,8 @@ def _look_from(directions: Sequence[tuple[float, float]], away: float) -> Simila
     return Similarity(np.stack(turns), np.tile([0.0, 0.0, away], (len(turns), 1)), np.ones(len(turns)))
 
 
-def _sheet(tiles: Sequence[np.ndarray], columns: int, gap: int = 6) -> np.ndarray:
+def lay_out(tiles: Sequence[np.ndarray], columns: int, gap: int = 6) -> UInt8[np.ndarray, "h w 3"]:
+    """Pictures in rows, so many side by side."""
     height, width = max(t.shape[0] for t in tiles), max(t.shape[1] for t in tiles)
     columns = min(columns, len(tiles))
     rows = -(-len(tiles) // columns)
@@ -109,7 +110,7 @@ def _sheet(tiles: Sequence[np.ndarray], columns: int, gap: int = 6) -> np.ndarra
     return sheet
 
 
-def _write(image: np.ndarray, text: str, place: tuple[int, int], colour: Sequence[int] = (255, 255, 255)) -> None:
+def write_label(image: np.ndarray, text: str, place: tuple[int, int], colour: Sequence[int] = (255, 255, 255)) -> None:
     """A line on a dark ground."""
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.38, 1)
     x, y = place

@@ -1,13 +1,14 @@
-"""``ipjax capture``: from a capture of a scene to a data set, a step a file."""
+"""``ipjax capture``: from a capture of a scene to a data set, at once or a step at a time."""
 
 from typing import Any
 
-from ipjax.commands.capture import arrange, check, depth, label, model, pose, refine, views
+from ipjax.commands.capture import arrange, check, depth, label, model, pose, refine, run, views
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (check, pose, refine, depth, model, label, views, arrange)  # as --help lists them
+STEPS = (run, check, pose, refine, depth, model, label, views, arrange)  # as --help lists them
 EXAMPLES = """\
 examples:
+  ipjax capture run table/ -o mytable/         all of it: mytable/ in BOP's layout, mytable.work/report.html
   ipjax capture check table/ -o check.html     what it has, what is missing, and what looks wrong
   ipjax capture pose table/ -o work/           where the camera stood, frame by frame: work/poses.json
   ipjax capture refine table/ -o work/         the same, made exact: work/refined.json

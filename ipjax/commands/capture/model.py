@@ -36,6 +36,13 @@ def add(steps: Any) -> None:
     parser = add_command(steps, "model", run, "make models of the objects and of the scene", EXAMPLES)
     add_capture(parser)
     options.add_output(parser, "WORK", "folder of what the steps make", required=True)
+    add_objects(parser)
+    add_again(parser)
+    options.add_reporting(parser, quiet="no progress bar")
+
+
+def add_objects(parser: Any) -> None:
+    """The options that say which objects there are, and how their models are made."""
     parser.add_argument("--click", action="append", type=_parse_click, metavar="NAME:X,Y", help="an object, by a pixel")
     parser.add_argument("--box", action="append", type=_parse_box, metavar="NAME:X,Y,W,H", help="an object, by a box")
     parser.add_argument("--support", type=_parse_pixel, metavar="X,Y", help="a pixel of what they stand on")
@@ -45,8 +52,21 @@ def add(steps: Any) -> None:
     parser.add_argument(
         "--shape-symmetries", action="store_true", help="symmetric is what the shape, not the colour, is"
     )
-    add_again(parser)
-    options.add_reporting(parser, quiet="no progress bar")
+
+
+def read_objects(arguments: argparse.Namespace) -> tuple[list[Any], Any]:
+    """What `add_objects` says: hints, and a ModelConfig; ValueError, in words, where it cannot be."""
+    from ipjax.capture.models.making import ModelConfig
+
+    if not 0.3 <= arguments.voxel <= 20:
+        raise ValueError(f"--voxel is in millimetres, from 0.3 to 20, not {arguments.voxel:g}")
+    config = ModelConfig(
+        voxel=arguments.voxel / 1000,
+        alone=not arguments.together,
+        close=arguments.close,
+        colour_symmetries=not arguments.shape_symmetries,
+    )
+    return [*(arguments.click or ()), *(arguments.box or ())], config
 
 
 def add_again(parser: Any) -> None:
@@ -57,22 +77,14 @@ def add_again(parser: Any) -> None:
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Make the models and write them; returns the exit status."""
     from ipjax.capture.labels.pictures import draw_models
-    from ipjax.capture.models.making import ModelConfig, make_models
+    from ipjax.capture.models.making import make_models
     from ipjax.capture.models.storing import read_made_of, write_models
     from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.inference.drawing import write_image
 
     work: Path = options.check_folder(arguments.output)
-    if not 0.3 <= arguments.voxel <= 20:
-        raise ValueError(f"--voxel is in millimetres, from 0.3 to 20, not {arguments.voxel:g}")
-    hints = [*(arguments.click or ()), *(arguments.box or ())]
+    hints, config = read_objects(arguments)
     frames = open_frames(arguments, work)
-    config = ModelConfig(
-        voxel=arguments.voxel / 1000,
-        alone=not arguments.together,
-        close=arguments.close,
-        colour_symmetries=not arguments.shape_symmetries,
-    )
     made_of = describe_inputs(arguments, work, {"config": repr(config), "hints": repr([*hints, arguments.support])})
     folder = work / "models"
     if read_made_of(folder) == made_of and not arguments.again:
