@@ -51,7 +51,12 @@ class Listener:
 
 
 def run_steps(
-    steps: Sequence[Step], job: Job, *, first: str | None = None, listener: Listener | None = None
+    steps: Sequence[Step],
+    job: Job,
+    *,
+    first: str | None = None,
+    anyway: bool = False,
+    listener: Listener | None = None,
 ) -> list[Done]:
     """Run the steps in their order; a step whose inputs and settings are the same and whose files are whole is kept.
 
