@@ -76,12 +76,11 @@ def _describe(job: Job, *, finished: bool) -> str:
 def _show(work: Path, step: Step, record: Record) -> dict:
     outcome = record.outcome
     picture = work / step.picture
-    first = next(iter(outcome.notes), "") if step.name != "check" else ""
     return {
         "name": step.name,
         "title": step.title,
         "does": step.does,
-        "first": first,
+        "summary": outcome.summary,
         "warnings": outcome.warnings,
         "picture": embed_image(_shrink(_read(picture)), "jpg") if picture.is_file() else None,
         "caption": step.caption,

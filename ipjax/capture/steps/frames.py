@@ -1,7 +1,6 @@
 """The frames of a capture as the steps after the poses use them."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
@@ -70,5 +69,5 @@ def choose_poses(job: Job) -> Trajectory:
 
 def open_frames(job: Job) -> CaptureFrames:
     """The frames with their best poses and depth, without what moves with the camera."""
-    depth: Path | None = job.work / "depth" if job.has("depth") else None
-    return CaptureFrames(hide(job.capture, read_ignored(job)), choose_poses(job), depth)
+    improved = job.work if job.has("depth") else None
+    return CaptureFrames(job.capture, choose_poses(job), improved, read_ignored(job))

@@ -37,6 +37,11 @@ class Outcome:
     warnings: tuple[str, ...] = ()  # what a person should look at, a sentence each
     stop: str | None = None  # why the steps after it make no sense; None = they do
 
+    @property
+    def summary(self) -> str:
+        """What matters most, in a sentence; "" = there is nothing to say."""
+        return next(iter(self.notes), "")
+
 
 @dataclasses.dataclass(frozen=True)
 class Job:
@@ -74,6 +79,7 @@ class Step:
     choose: Callable[[Any], Mapping[str, Any]]  # the settings that it heeds, as JSON knows them
     make: Callable[[Job], Outcome]
     into_dataset: bool = False  # it writes the data set, too
+    continues: bool = False  # interrupted, it goes on with what it wrote already
 
     @property
     def files(self) -> tuple[str, ...]:

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import errno
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -15,8 +14,10 @@ from ipjax.capture.steps.workspace import (
     LOG,
     STEPS,
     Record,
+    begin,
     describe_inputs,
     find_reason,
+    finish,
     forget,
     hash_capture,
     hash_file,
@@ -92,12 +93,11 @@ def run_steps(
             began = time.monotonic()
             if why is not None and index < start:
                 record, why = _take(step, job, made_of), FOUND
+                write_record(job.work, step.name, record)
             elif why is not None or record is None:
                 why = why or "it was not made yet"
                 listener.begins(step, why)
                 record = _make(step, job, made_of)
-            if why is not None:
-                write_record(job.work, step.name, record)
             records[step.name] = record
             done.append(Done(step, record, why, time.monotonic() - began))
             if why is not None:
@@ -137,15 +137,11 @@ def check_work(work: Path, steps: Sequence[Step], *, taken: bool) -> None:
 
 
 def _make(step: Step, job: Job, made_of: dict) -> Record:
-    forget(job.work, [step.name])  # from now on its files may be mixed
+    begin(job.work, step, made_of)
     outcome = step.make(job)
-    for name in {*step.files} - {*outcome.outputs}:  # of an earlier run, which found what this one did not
-        path = job.work / name
-        if path.is_dir():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
-    return Record(made_of, _hash(job.work, outcome.outputs), outcome)
+    record = Record(made_of, _hash(job.work, outcome.outputs), outcome)
+    finish(job.work, step, record)
+    return record
 
 
 def _take(step: Step, job: Job, made_of: dict) -> Record:

@@ -16,5 +16,6 @@ class RunSettings:
     seed: int = 0
     find_gripper: bool = True  # look for what moves with the camera
     keep_unsure: bool = False  # make models and labels also of frames whose pose is not sure
+    depth_mode: str = "solve"  # of the depth, as `make_depth` has it
     hints: tuple[Hint, ...] = ()  # which objects there are, as far as a person says so
     models: ModelConfig = dataclasses.field(default_factory=ModelConfig)

@@ -174,6 +174,36 @@ def write_record(work: Path, name: str, record: Record) -> None:
     write_text(record_path(work, name), json.dumps(document, indent=1, allow_nan=False) + "\n", parents=True)
 
 
+def begin(work: Path, step: Step, made_of: Mapping[str, Any]) -> None:
+    """Mark a step as begun. Where it would go on with files of other inputs, or of a finished run that is not whole any
+    more, these are removed; those of a run that was killed stay. Raises OSError.
+    """
+    forget(work, [step.name])  # from now on its files may be mixed
+    if not step.continues:
+        return
+    mark, text = work / STEPS / f"{step.name}.begun", hash_json(made_of)
+    if not mark.is_file() or mark.read_text() != text:
+        for name in step.files:
+            remove(work / name)
+        write_text(mark, text, parents=True)
+
+
+def finish(work: Path, step: Step, record: Record) -> None:
+    """Mark a step as finished: write its record, and remove what it did not write this time. Raises OSError."""
+    for name in {*step.files} - {*record.outcome.outputs}:
+        remove(work / name)
+    write_record(work, step.name, record)
+    (work / STEPS / f"{step.name}.begun").unlink(missing_ok=True)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
 def forget(work: Path, names: Iterable[str]) -> None:
     """Remove records, so that these steps are made again."""
     for name in names:
@@ -185,7 +215,4 @@ def remove_unfinished(work: Path, dataset: Path) -> None:
     left = list(work.glob(".*.part*")) + list((work / STEPS).glob(".*.part*"))
     left += list(dataset.parent.glob(f".{dataset.name}.*.part"))
     for path in left:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
+        remove(path)

@@ -49,22 +49,15 @@ def add(steps: Any) -> None:
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Make the data set and the report; returns the exit status."""
     dataset: Path = options.check_folder(arguments.output)
-    work: Path = options.check_folder(arguments.work or name_work(dataset))
+    work: Path | None = arguments.work
     hints, models = read_objects(arguments)
     seed = options.check_seed(arguments.seed)
     capture = open_given(arguments)
-    from ipjax.capture.poses.boards import parse_board
-    from ipjax.capture.report.page import NAME, write_report
-    from ipjax.capture.steps.chain import STEPS as CHAIN
-    from ipjax.capture.steps.labels import check_dataset
-    from ipjax.capture.steps.records import Job
-    from ipjax.capture.steps.running import Done, Listener, run_steps
+    from ipjax.capture.dataset import Run, make_dataset
+    from ipjax.capture.steps.running import Done, Listener
     from ipjax.capture.steps.settings import RunSettings
     from ipjax.inference.compilation_cache import use_compilation_cache
 
-    if arguments.board is not None:
-        parse_board(arguments.board)  # refused now, not after an hour
-    check_dataset(dataset)
     settings = RunSettings(
         method=arguments.method,
         board=arguments.board,
@@ -74,74 +67,52 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         hints=tuple(hints),
         models=models,
     )
-    job = Job(capture, work, dataset, settings)
     use_compilation_cache()
-    done: list[Done] = []
+    with _Bars(quiet=arguments.quiet) as bars:
 
-    def tell(one: Done) -> None:
-        done.append(one)
-        bars.close()
-        outcome = one.record.outcome
-        head = next(iter(outcome.notes), "") if one.step.name != "check" else ""
-        kept = "" if one.why is not None else " (kept)"
-        messages.say(f"{one.step.name:<7}{kept} {head or one.step.title}")
-        for text in outcome.warnings:
-            messages.say(f"  {text}", mark="warning:", style="yellow")
+        def tell(one: Done) -> None:
+            bars.close()
+            kept = "" if one.why is not None else " (kept)"
+            messages.say(f"{one.step.name:<7}{one.record.outcome.summary or one.step.title}{kept}")
+            for text in one.record.outcome.warnings:
+                messages.say(f" {text}", mark="warning:", style="yellow")
 
-    bars = _Bars(quiet=arguments.quiet)
-    listener = Listener(begins=bars.begin, ends=tell, progress=bars.show)
-    try:
-        run_steps(CHAIN, job, first=arguments.first, anyway=arguments.anyway, listener=listener)
-    except (ValueError, OSError, RuntimeError) as error:
-        bars.close()
-        if done:
-            _write_what_there_is(job, CHAIN, done, error)
-        raise
-    report = write_report(job, CHAIN, [(one.step, one.record) for one in done])
-    last = done[-1].record.outcome
-    stopped = last.stop if len(done) < len(CHAIN) else None
-    if stopped:
-        messages.say(f"It stops here: {stopped} (--anyway goes on)")
+        run: Run = make_dataset(
+            capture,
+            dataset,
+            work=work,
+            settings=settings,
+            first=arguments.first,
+            anyway=arguments.anyway,
+            listener=Listener(begins=bars.begin, ends=tell, progress=bars.show),
+        )
+    if run.stopped:
+        messages.say(f"It stops here: {run.stopped} Look at {run.report}; --anyway goes on.")
     else:
-        messages.say(f"The data set is {dataset}; look at {work / NAME} before you use it.")
+        messages.say(f"The data set is {dataset}; look at {run.report} before you use it.")
     messages.finish(
         {
-            "dataset": None if stopped else str(dataset),
-            "work": str(work),
-            "report": str(report),
-            "stopped": stopped,
-            "steps": [
-                {
-                    "step": one.step.name,
-                    "made": one.why is not None,
-                    "why": one.why,
-                    "seconds": round(one.seconds, 2),
-                    "figures": {figure.name: [figure.value, figure.unit] for figure in one.record.outcome.figures},
-                    "warnings": list(one.record.outcome.warnings),
-                    "notes": list(one.record.outcome.notes),
-                }
-                for one in done
-            ],
+            "dataset": None if run.stopped else str(dataset),
+            "work": str(run.work),
+            "report": str(run.report),
+            "stopped": run.stopped,
+            "steps": [_tell(one) for one in run.done],
         }
     )
-    return 1 if stopped else 0
+    return 1 if run.stopped else 0
 
 
-def name_work(dataset: Path) -> Path:
-    """The folder beside the data set in which the steps work; BOP's tools look into the data set only."""
-    whole = dataset.resolve() if not dataset.name else dataset
-    return whole.with_name(f"{whole.name}.work")
-
-
-def _write_what_there_is(job: Any, chain: Any, done: Any, error: Exception) -> None:
-    """The report of the steps before the one that failed; where that fails, too, the first error is told."""
-    import contextlib
-
-    from ipjax.capture.report.page import write_report
-    from ipjax.commands.interface.messages import in_one_line
-
-    with contextlib.suppress(OSError):
-        write_report(job, chain, [(one.step, one.record) for one in done], in_one_line(error))
+def _tell(one: Any) -> dict[str, Any]:
+    outcome = one.record.outcome
+    return {
+        "step": one.step.name,
+        "made": one.why is not None,
+        "why": one.why,
+        "seconds": round(one.seconds, 2),
+        "figures": {figure.name: [figure.value, figure.unit] for figure in outcome.figures},
+        "warnings": list(outcome.warnings),
+        "notes": list(outcome.notes),
+    }
 
 
 class _Bars(Bars):

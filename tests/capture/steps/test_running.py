@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from builders import killed_runs
-from builders.killed_runs import hash_run, make_job, make_steps, write_numbers
+from builders.killed_runs import hash_files, make_job, make_steps, write_numbers
 
 from ipjax.capture.records import CaptureError
 from ipjax.capture.steps.running import Listener, run_steps
@@ -40,20 +40,20 @@ def test_killed_at_every_moment_it_goes_on_to_the_same_files(tmp_path):
 def test_a_step_is_made_again_exactly_when_it_has_to_be(folder):
     assert rerun(folder) == (["count", "spread", "publish"], ["it was not made yet"] * 3)
     assert rerun(folder) == ([], [None] * 3)
-    before = hash_run(make_job(folder, "out"))
+    before = hash_files(folder / "out.work")
 
     (folder / "out" / "1.bin").unlink()
     assert rerun(folder) == (["publish"], [None, None, "../out/1.bin is missing"])
     (folder / "out.work" / "spread" / "0.bin").write_bytes(b"x")
     assert rerun(folder)[1] == [None, "spread/0.bin was changed", None]  # its result is the old one again
-    assert hash_run(make_job(folder, "out")) == before
+    assert hash_files(folder / "out.work") == before and len(hash_files(folder / "out")) == 2
 
     made, why = rerun(folder, odd=True)
     assert made == ["count", "spread"] and why[:2] == ["its settings changed (odd)", "what the step count made changed"]
     assert (folder / "out.work" / "odd.txt").is_file()
     rerun(folder)
     assert not (folder / "out.work" / "odd.txt").exists()  # nothing of the other settings stays
-    assert hash_run(make_job(folder, "out")) == before
+    assert hash_files(folder / "out.work") == before
 
     (folder / "capture" / "notes.md").write_text("no input")
     assert rerun(folder)[0] == []
