@@ -10,18 +10,24 @@ from builders.killed_runs import hash_files
 
 from ipjax.bop.dataset import Dataset
 from ipjax.capture.dataset import make_dataset, name_work
+from ipjax.capture.models.making import ModelConfig
 from ipjax.capture.steps.chain import STEPS
 from ipjax.capture.steps.running import Listener
+from ipjax.capture.steps.settings import RunSettings
 from ipjax.commands.capture import run as command
 from ipjax.synthetic.captures import make_capture, write_capture
+from ipjax.synthetic.sensor import PERFECT
 
 NAMES = [step.name for step in STEPS]
+SETTINGS = RunSettings(models=ModelConfig(voxel=0.004))  # as wide as what a pixel of these images sees
 
 
 @pytest.fixture(scope="module")
 def made():
     """A third of the way around a table with two objects, in small images."""
-    return make_capture(3, views=8, arc=120, objects=2, sizes=(0.2, 0.17), size=(240, 180), factory_error=0)
+    return make_capture(
+        3, views=8, arc=120, objects=2, sizes=(0.2, 0.17), size=(240, 180), sensor=PERFECT, factory_error=0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +39,7 @@ def folder(made, tmp_path_factory):
 def undisturbed(folder, tmp_path_factory):
     """A data set that was made at once."""
     dataset = tmp_path_factory.mktemp("undisturbed") / "mytable"
-    made = make_dataset(folder, dataset)
+    made = make_dataset(folder, dataset, settings=SETTINGS)
     assert [one.step.name for one in made.done] == NAMES and all(one.why for one in made.done) and not made.stopped
     return dataset
 
@@ -88,22 +94,27 @@ def test_interrupted_in_every_step_it_ends_with_the_same_files(folder, undisturb
     for index, name in enumerate(NAMES):
         listener = _Interrupting(name)
         with pytest.raises(KeyboardInterrupt):
-            make_dataset(folder, dataset, listener=Listener(begins=listener.begin, progress=listener.show))
+            make_dataset(
+                folder, dataset, settings=SETTINGS, listener=Listener(begins=listener.begin, progress=listener.show)
+            )
         assert listener.begun == NAMES[max(index - 1, 0) : index + 1]  # what was interrupted last, and this one
         assert not dataset.exists()
-    assert [one.why is None for one in make_dataset(folder, dataset).done] == [True] * (len(NAMES) - 1) + [False]
+    assert [one.why is None for one in make_dataset(folder, dataset, settings=SETTINGS).done] == [True] * (
+        len(NAMES) - 1
+    ) + [False]
     assert hash_files(dataset) == hash_files(undisturbed)
     assert hash_files(name_work(dataset)) == hash_files(name_work(undisturbed))
 
 
 def test_a_second_run_keeps_everything(folder, undisturbed, capfd):
     before = hash_files(name_work(undisturbed))
-    assert run(["capture", "run", str(folder), "-o", str(undisturbed), "--quiet", "--json"]) == 0
+    words = ["capture", "run", str(folder), "-o", str(undisturbed), "--voxel", "4", "--quiet"]
+    assert run([*words, "--json"]) == 0
     told = json.loads(capfd.readouterr().out)
     assert [step["step"] for step in told["steps"]] == NAMES and not any(step["made"] for step in told["steps"])
     assert told["dataset"] == str(undisturbed) and told["stopped"] is None
     assert told["steps"][1]["figures"]["frames with a pose"] == ["8 of 8", ""]
-    assert run(["capture", "run", str(folder), "-o", str(undisturbed), "--quiet", "--from", "label"]) == 0
+    assert run([*words, "--from", "label"]) == 0
     out = capfd.readouterr().out
     assert out.count("(kept)") == len(NAMES) - 1 and "look at" in out and "report.html" in out
     assert hash_files(name_work(undisturbed)) == before
