@@ -19,14 +19,15 @@ from ipjax.synthetic.captures import make_capture, write_capture
 from ipjax.synthetic.sensor import PERFECT
 
 NAMES = [step.name for step in STEPS]
-SETTINGS = RunSettings(models=ModelConfig(voxel=0.004))  # as wide as what a pixel of these images sees
+# Voxels as wide as what a pixel of these images sees; the depth camera, which others test, is not solved.
+SETTINGS = RunSettings(depth_mode="factory", models=ModelConfig(voxel=0.004))
 
 
 @pytest.fixture(scope="module")
 def made():
-    """A third of the way around a table with two objects, in small images."""
+    """A quarter of the way around a table with two objects, in small images."""
     return make_capture(
-        3, views=8, arc=120, objects=2, sizes=(0.2, 0.17), size=(240, 180), sensor=PERFECT, factory_error=0
+        3, views=6, arc=90, objects=2, sizes=(0.2, 0.17), size=(240, 180), sensor=PERFECT, factory_error=0
     )
 
 
@@ -57,13 +58,17 @@ def test_the_data_set_loads_and_is_true(made, undisturbed):
     frame, truths = dataset.frame(0, 0), dataset.truths(0, 0)
     np.testing.assert_array_equal(frame.rgb, made.rgb[0])
     assert len(truths) == 2
-    # Each mask is one of the objects that stand there.
+    # Each label is one of the objects that stand there, in all frames.
     found = set()
     for index in range(2):
-        mask = dataset.mask(0, 0, index)
-        overlaps = [(mask & (made.ids[0] == k)).sum() / (mask | (made.ids[0] == k)).sum() for k in range(2)]
-        assert max(overlaps) > 0.7
-        found.add(int(np.argmax(overlaps)))
+        overlaps = np.zeros((len(made.names), 2))
+        for image in range(len(made.names)):
+            mask = dataset.mask(0, image, index)
+            for number in range(2):
+                true = made.ids[image] == number
+                overlaps[image, number] = (mask & true).sum() / (mask | true).sum()
+        assert np.median(overlaps, axis=0).max() > 0.6  # of images of which a pixel sees 3 mm
+        found.add(int(np.median(overlaps, axis=0).argmax()))
     assert found == {0, 1}
 
 
@@ -72,7 +77,7 @@ def test_the_report_shows_all_steps(undisturbed):
     assert page.count("data:image/jpeg;base64,") == len(STEPS) and 'src="http' not in page
     for step in STEPS:
         assert f'id="{step.name}"' in page and step.caption.replace("'", "&#39;")[:60] in page
-    assert "8 of 8" in page and "What next" in page and str(undisturbed.parent) not in page
+    assert "6 of 6" in page and "What next" in page and str(undisturbed.parent) not in page
 
 
 class _Interrupting:
@@ -108,12 +113,23 @@ def test_interrupted_in_every_step_it_ends_with_the_same_files(folder, undisturb
 
 def test_a_second_run_keeps_everything(folder, undisturbed, capfd):
     before = hash_files(name_work(undisturbed))
-    words = ["capture", "run", str(folder), "-o", str(undisturbed), "--voxel", "4", "--quiet"]
+    words = [
+        "capture",
+        "run",
+        str(folder),
+        "-o",
+        str(undisturbed),
+        "--voxel",
+        "4",
+        "--depth-mode",
+        "factory",
+        "--quiet",
+    ]
     assert run([*words, "--json"]) == 0
     told = json.loads(capfd.readouterr().out)
     assert [step["step"] for step in told["steps"]] == NAMES and not any(step["made"] for step in told["steps"])
     assert told["dataset"] == str(undisturbed) and told["stopped"] is None
-    assert told["steps"][1]["figures"]["frames with a pose"] == ["8 of 8", ""]
+    assert told["steps"][1]["figures"]["frames with a pose"] == ["6 of 6", ""]
     assert run([*words, "--from", "label"]) == 0
     out = capfd.readouterr().out
     assert out.count("(kept)") == len(NAMES) - 1 and "look at" in out and "report.html" in out

@@ -22,7 +22,7 @@ dataset = Dataset("{dataset}")
 frame, truths = dataset.frame(0, 0), dataset.truths(0, 0)
 
 # find an object of it elsewhere
-ipjax onboard {dataset}/models/obj_000001.ply --units mm -o object.ipjax
+ipjax onboard {dataset}/models/obj_000001.ply --unit mm -o object.ipjax
 ipjax estimate object.ipjax --rgb photo.png --depth depth.png --camera camera.json
 
 # measure estimates against it

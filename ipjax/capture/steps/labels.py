@@ -83,7 +83,7 @@ STEP = Step(
     picture="labels.png",
     caption="What is visible of each object, its box and its visible share. Right if outlines lie on the objects' "
     "edges in all frames; if they are off in some, those frames' poses are wrong.",
-    needs=("refine", "pose", "model"),
+    needs=("pose", "refine", "depth", "model"),
     results=(),
     sometimes=(),
     extras=(),

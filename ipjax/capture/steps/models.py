@@ -51,7 +51,7 @@ STEP = Step(
     caption="Each object from four sides, in its colours and as a shape; red was not measured. Right if every object "
     "of the table is there once, whole, and nothing of its neighbours is on it. If not: --click NAME:X,Y on "
     "each of them.",
-    needs=("refine", "pose"),
+    needs=("pose", "refine", "depth"),
     results=("models",),
     sometimes=(),
     extras=(),

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ipjax.commands.capture.bars import Bars
+from ipjax.commands.capture.depth import MODES
 from ipjax.commands.capture.model import add_objects, read_objects
 from ipjax.commands.capture.opening import add_capture, open_given
 from ipjax.commands.capture.pose import METHODS
@@ -12,17 +13,17 @@ from ipjax.commands.interface import options
 from ipjax.commands.interface.messages import Messages
 from ipjax.commands.interface.parser import add_command
 
-STEPS = ("check", "pose", "refine", "model", "label")
+STEPS = ("check", "pose", "refine", "depth", "model", "label")
 EXAMPLES = """\
 examples:
   ipjax capture run table/ -o mytable/
   ipjax capture run table/ -o mytable/ --click mug:312,204 --click box:420,233@000007    what touches, told apart
   ipjax capture run table/ -o mytable/ --from model         models and labels again, poses as they are
 
-Steps: check, pose, refine, model, label. Writes the data set in BOP's layout, DATASET, and beside it DATASET.work: what
-each step made, with a picture, and report.html, which shows all of them. Kill it at any moment and call it again: what
-is finished is not made again, unless the capture, settings or code it was made of changed. Single steps work in the
-same folder: ipjax capture model table/ -o mytable.work --click …, then run --from label.
+Steps: check, pose, refine, depth, model, label. Writes the data set in BOP's layout, DATASET, and beside it the folder
+DATASET.work: what each step made, with a picture, and report.html, which shows all of them. Kill it at any moment and
+call it again: what is finished is not made again, unless the capture, settings or code it was made of changed. Single
+steps work in the same folder: ipjax capture model table/ -o mytable.work --click …, then run --from label.
 
 Frames without a pose, or whose pose is not sure, are left out, and named. Exits with 1 where the capture cannot be used
 as it is.
@@ -40,6 +41,7 @@ def add(steps: Any) -> None:
     parser.add_argument("--method", choices=METHODS, default="auto", help="of the first poses (default auto)")
     parser.add_argument("--board", metavar="WORD", help="a board that lies in the scene; see ipjax capture pose --help")
     parser.add_argument("--keep-gripper", action="store_true", help="do not look for things that move with the camera")
+    parser.add_argument("--depth-mode", choices=MODES, default="solve", help="see ipjax capture depth --help")
     parser.add_argument("--keep-unsure", action="store_true", help="keep frames whose pose is not sure")
     add_objects(parser)
     options.add_seed(parser)
@@ -64,6 +66,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         seed=seed,
         find_gripper=not arguments.keep_gripper,
         keep_unsure=arguments.keep_unsure,
+        depth_mode=arguments.depth_mode,
         hints=tuple(hints),
         models=models,
     )
