@@ -6,11 +6,15 @@ import json
 import numpy as np
 
 from ipjax.capture.labels.pictures import draw_models
-from ipjax.capture.models.making import ObjectModel, make_models
+from ipjax.capture.models.making import ObjectModel, SceneModels, make_models
 from ipjax.capture.models.storing import write_models
 from ipjax.capture.steps.frames import open_frames
-from ipjax.capture.steps.records import Figure, Job, Outcome, Step
+from ipjax.capture.steps.records import Figure, Job, Outcome, Step, say
+from ipjax.files.meshes.mesh import corner_products
 from ipjax.inference.drawing import write_image
+
+_RISES = 0.015  # metres above the support, above which a surface is no noise of it
+_APART = 0.015  # metres from the objects, beyond which a surface is none of theirs
 
 
 def model(job: Job) -> Outcome:
@@ -26,8 +30,29 @@ def model(job: Job) -> Outcome:
         measured = float((item.mesh.seen > 0).mean())
         if measured < 0.5:
             warnings.append(f"Only {100 * measured:.0f} % of the surface of {item.name} was measured.")
-    notes = tuple(f"{line[0].upper()}{line[1:]}." for line in found.notes)
+    left = measure_left_over(found)
+    if left > job.settings.models.least_area:
+        warnings.append(
+            f"{1e4 * left:.0f} cm² of surface above the table belong to no object: something seen from too few "
+            "sides, or not down to the table; --click NAME:X,Y on it makes it one."
+        )
+    names = ", ".join(item.name for item in found.objects)
+    notes = (f"{len(found.objects)} {'object' if len(found.objects) == 1 else 'objects'}: {names}.",)
+    notes += tuple(map(say, found.notes))
     return Outcome(("models", "models.png"), tuple(figures), notes, tuple(warnings))
+
+
+def measure_left_over(found: SceneModels) -> float:
+    """How much of the surface that rises above the support is near none of the objects; m²."""
+    from scipy.spatial import cKDTree
+
+    scene, support = found.scene, found.support
+    rises = (support.heights(scene.vertices) > _RISES) & support.covers(scene.vertices)
+    points = np.concatenate([item.world_from_model @ item.mesh.vertices for item in found.objects])
+    alone = rises.copy()
+    alone[rises] = cKDTree(points).query(scene.vertices[rises])[0] > _APART
+    faces = scene.faces[alone[scene.faces].all(1)]
+    return float(np.linalg.norm(corner_products(scene.vertices, faces), axis=-1).sum() / 2)
 
 
 def _describe(item: ObjectModel) -> tuple[str, str, str]:
