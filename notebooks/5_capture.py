@@ -135,4 +135,4 @@ assert [one.why is None for one in again.done] == [True] * 5 + [False]
 assert {(obj_id, number) for obj_id, number, _ in shares} in ({(1, 0), (2, 1)}, {(1, 1), (2, 0)})
 assert np.median([share for *_, share in shares]) > 0.85
 assert json.loads((run.dataset / "dataset_info.json").read_text())["frames"] == list(made.names)
-assert abs(info.metres_per_unit / info.mesh_scale - dataset.models()[1].diameter) < 1e-4
+assert info.metres_per_unit and abs(info.metres_per_unit / info.mesh_scale - dataset.models()[1].diameter) < 1e-4

@@ -48,6 +48,7 @@ def test_help_teaches_by_examples(name, capfd):
         "weights fetch --help",
         "capture check --help",
         "capture pose --help",
+        "capture run --help",
     ],
 )
 def test_help_and_version_load_nothing_but_the_command(words):

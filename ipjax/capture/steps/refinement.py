@@ -27,6 +27,7 @@ def refine_poses(job: Job) -> Outcome:
     depths: list[Any] = [None] * len(capture)
     for index in np.flatnonzero(before.registered):
         frame = capture.read_frame(int(index))
+        assert frame.depth is not None  # or `refine` had refused it
         depths[index] = np.where(frame.usable, frame.depth, 0)
     neighbours = list_neighbours(before.registered)
     apart = [

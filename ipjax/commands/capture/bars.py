@@ -1,5 +1,7 @@
 """The progress of a step, a bar for each of its parts."""
 
+from typing import Self
+
 
 class Bars:
     """A progress bar for each part of the work."""
@@ -7,7 +9,7 @@ class Bars:
     def __init__(self, *, quiet: bool):
         self.quiet, self.part, self.bar = quiet, "", None
 
-    def __enter__(self) -> "Bars":
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
