@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ipjax.capture.poses.boards import parse_board
 from ipjax.capture.reading.opening import open_capture
-from ipjax.capture.records import Capture
+from ipjax.capture.records import Capture, CaptureError
 from ipjax.capture.report.page import write_report
 from ipjax.capture.steps.chain import STEPS
 from ipjax.capture.steps.labels import check_dataset
@@ -58,7 +58,11 @@ def make_dataset(
     if settings.board is not None:
         parse_board(settings.board)  # refused now, not after the features
     check_dataset(dataset)
-    job = Job(capture, name_work(dataset) if work is None else Path(work), dataset, settings)
+    work = name_work(dataset) if work is None else Path(work)
+    for place in (dataset, work):
+        if capture.folder.resolve().is_relative_to(place.resolve()):
+            raise CaptureError(f"{place}: the capture itself lies in it, and would be replaced; give another folder")
+    job = Job(capture, work, dataset, settings)
     told, done = listener or Listener(), []
 
     def end(one: Done) -> None:

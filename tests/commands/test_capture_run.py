@@ -156,6 +156,10 @@ def test_refuses_in_one_line(folder, undisturbed, tmp_path, capfd):
     copy = shutil.copytree(undisturbed, tmp_path / "copy")
     (copy / "results.csv").write_text("x")
     assert "has results.csv in it" in refused(folder, "-o", copy)
+    assert "the capture itself lies in it" in refused(
+        folder, "-o", tmp_path / "out", "--work", folder, "--from", "model"
+    )
+    assert "the capture itself lies in it" in refused(undisturbed / "test" / "000000", "-o", undisturbed)
     file = tmp_path / "file"
     file.write_text("x")
     assert "a file of this name is in the way" in refused(folder, "-o", file)
