@@ -1,7 +1,5 @@
 """The progress of a step, a bar for each of its parts."""
 
-from typing import Self
-
 
 class Bars:
     """A progress bar for each part of the work."""
@@ -9,7 +7,7 @@ class Bars:
     def __init__(self, *, quiet: bool):
         self.quiet, self.part, self.bar = quiet, "", None
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Bars":
         return self
 
     def __exit__(self, *_: object) -> None:

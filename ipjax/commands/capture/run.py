@@ -71,7 +71,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         models=models,
     )
     use_compilation_cache()
-    with _Bars(quiet=arguments.quiet) as bars:
+    bars = _Bars(quiet=arguments.quiet)
+    with bars:
 
         def tell(one: Done) -> None:
             bars.close()
