@@ -50,7 +50,8 @@ def label(job: Job) -> Outcome:
         if seen < max(2, len(frames) / 10):
             warnings.append(f"{item.name} is seen in {seen} of {len(frames)} frames only.")
     relative = os.path.relpath(job.dataset, job.work)
-    notes = (f"{len(frames)} frames with {len(models)} objects, in BOP's layout.",)
+    objects = "1 object" if len(models) == 1 else f"{len(models)} objects"
+    notes = (f"{len(frames)} frames with {objects}, in BOP's layout.",)
     return Outcome(("labels.png", relative), tuple(figures), notes, tuple(warnings))
 
 

@@ -192,8 +192,9 @@ def finish(work: Path, step: Step, record: Record) -> None:
     """Mark a step as finished: write its record, and remove what it did not write this time. Raises OSError."""
     for name in {*step.files} - {*record.outcome.outputs}:
         remove(work / name)
-    write_record(work, step.name, record)
+    # First the mark: with the record the step is kept, and a mark that a kill left would stay.
     (work / STEPS / f"{step.name}.begun").unlink(missing_ok=True)
+    write_record(work, step.name, record)
 
 
 def remove(path: Path) -> None:
@@ -212,7 +213,7 @@ def forget(work: Path, names: Iterable[str]) -> None:
 
 def remove_unfinished(work: Path, dataset: Path) -> None:
     """Remove what a killed run was writing; for whoever holds the folder's lock."""
-    left = list(work.glob(".*.part*")) + list((work / STEPS).glob(".*.part*"))
+    left = list(work.rglob(".*.part*"))  # a step that continues writes file by file, also into folders
     left += list(dataset.parent.glob(f".{dataset.name}.*.part"))
     for path in left:
         remove(path)

@@ -31,7 +31,7 @@ def rerun(folder, *, first=None, anyway=False, **settings) -> tuple[list[str], l
 def test_killed_at_every_moment_it_goes_on_to_the_same_files(tmp_path):
     paths = [str(Path(killed_runs.__file__).parents[1]), *sys.path]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    command = [sys.executable, killed_runs.__file__, str(tmp_path)]
+    command = [sys.executable, "-W", "ignore::RuntimeWarning", killed_runs.__file__, str(tmp_path)]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
     assert ran.returncode == 0, ran.stderr
     assert int(ran.stdout) > 40  # moments
