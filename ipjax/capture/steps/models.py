@@ -19,7 +19,10 @@ _APART = 0.015  # metres from the objects, beyond which a surface is none of the
 
 def model(job: Job) -> Outcome:
     """Models of the objects and of the scene."""
-    found = make_models(list(open_frames(job)), job.settings.hints, job.settings.models, progress=job.progress)
+    given = job.settings
+    found = make_models(
+        list(open_frames(job)), given.hints, given.models, support_at=given.support, progress=job.progress
+    )
     write_models(job.work / "models", found)
     write_image(job.work / "models.png", draw_models(found.objects))
     figures = [Figure("objects", len(found.objects), "", "count them in the picture of the labels")]
@@ -83,6 +86,7 @@ STEP = Step(
     modules=("ipjax.capture.steps.models",),
     choose=lambda of: {
         "hints": _tell_hints(of.hints),
+        "support": None if of.support is None else dataclasses.asdict(of.support),
         "models": json.loads(json.dumps(dataclasses.asdict(of.models))),
         "keep_unsure": of.keep_unsure,
     },

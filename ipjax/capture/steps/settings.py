@@ -18,4 +18,5 @@ class RunSettings:
     keep_unsure: bool = False  # make models and labels also of frames whose pose is not sure
     depth_mode: str = "solve"  # of the depth, as `make_depth` has it
     hints: tuple[Hint, ...] = ()  # which objects there are, as far as a person says so
+    support: Hint | None = None  # a pixel of what the objects stand on
     models: ModelConfig = dataclasses.field(default_factory=ModelConfig)

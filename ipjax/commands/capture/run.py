@@ -68,6 +68,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         keep_unsure=arguments.keep_unsure,
         depth_mode=arguments.depth_mode,
         hints=tuple(hints),
+        support=arguments.support,
         models=models,
     )
     use_compilation_cache()
