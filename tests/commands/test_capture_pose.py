@@ -41,8 +41,9 @@ def test_finds_poses(made, folder, tmp_path, capfd):
         assert picture.size[0] == 1440 and len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 20
     assert {path.name for path in work.iterdir()} >= {"poses.json", "tracks.npz", "trajectory.png"}
     before = (work / "poses.json").read_bytes()
+    (work / "refined.json").write_text("of other poses")
     assert run(["capture", "pose", str(folder), "-o", str(work), "--quiet"]) == 0
-    assert (work / "poses.json").read_bytes() == before
+    assert (work / "poses.json").read_bytes() == before and not (work / "refined.json").exists()
     assert "7 of 7 frames have a pose, by features and depth." in capfd.readouterr().out
 
 

@@ -28,7 +28,7 @@ from ipjax.files.storage.folders import writing_folder
 from ipjax.files.storage.parsing import read_json
 from ipjax.files.storage.writing import write_text, writing
 
-DEPTH_SCALE = 0.1  # millimetres per number of the depth images: up to 6.5 m
+DEPTH_SCALE = 0.1  # millimetres per number of the depth images: up to 6.5 m; what is farther is left out
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,7 +172,8 @@ def _write_models(folder: Path, models: Sequence[ObjectModel]) -> None:
 
 
 def _write_images(place: Path, number: int, frame: PosedFrame, label: FrameLabels) -> None:
-    depth = np.clip(np.round(frame.depth.astype(np.float64) * 1000 / DEPTH_SCALE), 0, 65535).astype(np.uint16)
+    depth = np.round(frame.depth.astype(np.float64) * 1000 / DEPTH_SCALE)
+    depth = np.where(depth <= 65535, depth, 0).astype(np.uint16)  # what is farther is not known, rather than nearer
     _write_image(place / "rgb" / f"{number:06d}.png", frame.rgb)
     _write_image(place / "depth" / f"{number:06d}.png", depth)
     for index, (whole, visible) in enumerate(zip(label.whole, label.visible, strict=True)):

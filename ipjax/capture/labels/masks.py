@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ipjax.bop.detections import box_of
 from ipjax.cameras import crop, project
 from ipjax.capture.labels.borders import snap
 from ipjax.capture.models.frames import PosedFrame
@@ -147,10 +148,7 @@ def settle(ids: np.ndarray, drawn: Float[np.ndarray, "h w"], frame: PosedFrame) 
 
 def find_box(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
     """The tight box of a mask: x, y, width, height; −1 four times where it is empty."""
-    columns, rows = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
-    if not len(columns):
-        return (-1, -1, -1, -1)
-    return int(columns[0]), int(rows[0]), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+    return box_of(mask) or (-1, -1, -1, -1)
 
 
 def _find_overhang(

@@ -30,14 +30,16 @@ LIST = "models.json"
 
 
 def write_models(folder: str | Path, models: SceneModels, made_of: str = "") -> Path:
-    """Write models as a folder, whole or not at all; one that is there gives way.
+    """Write models as a folder, whole or not at all; models that are there give way.
 
     Args:
       made_of: a word for all that they were made of, by which another run knows that they need not be made again.
 
     Raises:
+      CaptureError: `check_place` says that the folder holds something else.
       OSError: it cannot be written.
     """
+    check_place(folder)
     with writing_folder(folder, replace=True) as inside:
         entries = []
         for item in models.objects:
@@ -75,6 +77,17 @@ def write_models(folder: str | Path, models: SceneModels, made_of: str = "") -> 
         }
         write_text(inside / LIST, json.dumps(document, indent=1))
     return Path(folder)
+
+
+def check_place(folder: str | Path) -> None:
+    """Refuse to write models in place of anything but models. Raises CaptureError."""
+    folder = Path(folder)
+    if folder.exists() and not folder.is_dir():
+        raise CaptureError(f"{folder}: a file of this name is in the way")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / LIST).is_file():
+        raise CaptureError(
+            f"{folder}: it is there, and has no models of ipjax capture; it is not replaced: give another folder"
+        )
 
 
 def read_models(folder: str | Path) -> tuple[ObjectModel, ...]:

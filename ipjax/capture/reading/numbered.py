@@ -46,7 +46,9 @@ def open_numbered(folder: Path, *, camera: Any, depth_scale: float | int | None,
     for path in sorted(folder.iterdir()):
         match = _FILE.fullmatch(path.name)
         if match is not None and (match["kind"] != "color" or f".{match['end'].lower()}" in COLOURS):
-            found[match["kind"]][match["name"]] = path
+            other = found[match["kind"]].setdefault(match["name"], path)
+            if other != path:
+                raise CaptureError(f"{folder}: {other.name} and {path.name} are two files of one frame; keep one")
     names = list(found["color"])[chosen]
     raws = {path.name.removesuffix(".depth.png"): path for path in sorted((folder / "raw").glob("*.depth.png"))}
     for images, where in ((found["depth"], folder), (raws, folder / "raw")):

@@ -102,6 +102,10 @@ def open_tum(folder: Path, *, camera: Any, depth_scale: float | int | None, pose
             world_from_camera = given
     picked = np.flatnonzero(known)[chosen]
     files = [FrameFiles(frames[i][1].stem, frames[i][1], frames[i][2]) for i in picked]
+    stems = [item.name for item in files]
+    twice = next((name for name in stems if stems.count(name) > 1), None) if len(set(stems)) < len(stems) else None
+    if twice is not None:
+        raise CaptureError(f"{folder}: two of its images are called {twice}; frames are told apart by these names")
     if world_from_camera is not None:
         world_from_camera = type(world_from_camera)(
             world_from_camera.rotation[picked], world_from_camera.translation[picked], world_from_camera.scale[picked]

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.inference.drawing import write_image
 
     work: Path = options.check_folder(arguments.output)
-    root: Path = arguments.dataset or work / "dataset"
+    root: Path = options.check_folder(arguments.dataset or work / "dataset")
     models = list(read_models(work / "models"))
     frames = open_frames(arguments, work)
     known = [(str(path), path.stat().st_mtime_ns if path.is_file() else 0) for path in arguments.known or ()]

@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Make the models and write them; returns the exit status."""
     from ipjax.capture.labels.pictures import draw_models
     from ipjax.capture.models.making import make_models
-    from ipjax.capture.models.storing import read_made_of, write_models
+    from ipjax.capture.models.storing import check_place, read_made_of, write_models
     from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.inference.drawing import write_image
 
@@ -87,6 +87,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     frames = open_frames(arguments, work)
     made_of = describe_inputs(arguments, work, {"config": repr(config), "hints": repr([*hints, arguments.support])})
     folder = work / "models"
+    check_place(folder)
     if read_made_of(folder) == made_of and not arguments.again:
         messages.say(f"{folder} was made of the same already; --again makes it once more.")
         messages.finish({"models": str(folder), "made": False})
@@ -142,12 +143,13 @@ def describe_inputs(arguments: argparse.Namespace, work: Path, about: dict[str, 
     files = [path for path in (poses or find_poses(work), work / "ignore.png") if path is not None and path.is_file()]
     texts = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
     lists = {}
-    for folder in (arguments.folder, work / "depth"):
+    own = work.resolve()  # may lie in the capture's folder, and what is in it changes with every step
+    for kind, folder in (("capture", arguments.folder), ("depth", work / "depth"), ("confidence", work / "confidence")):
         if folder.is_dir():
             entries = sorted(p for p in folder.rglob("*") if p.is_file())
-            lists[str(folder.name)] = [
-                (str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in entries
-            ]
+            if kind == "capture":
+                entries = [p for p in entries if not p.resolve().is_relative_to(own)]
+            lists[kind] = [(str(p.relative_to(folder)), p.stat().st_size, p.stat().st_mtime_ns) for p in entries]
     told = [arguments.form, arguments.camera, arguments.depth_scale, arguments.every, texts, lists, about]
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 

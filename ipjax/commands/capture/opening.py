@@ -21,7 +21,13 @@ def add_capture(parser: Any) -> None:
 def open_given(arguments: argparse.Namespace, *, poses: bool = True) -> Any:
     """The capture that the options of `add_capture` name. Raises CaptureError in one sentence."""
     from ipjax.capture.reading.opening import open_capture
+    from ipjax.capture.records import CaptureError
 
+    # Both may have poses.json, ignore.png and depth/, and what was recorded cannot be made again.
+    if arguments.output is not None and arguments.output.resolve() == arguments.folder.resolve():
+        raise CaptureError(
+            f"{arguments.output}: what is made would replace the capture's own files; give another folder"
+        )
     return open_capture(
         arguments.folder,
         form=arguments.form,

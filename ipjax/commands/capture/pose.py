@@ -68,6 +68,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     (work / "ignore.png").unlink(missing_ok=True)  # of an earlier run; `refine` takes it for this one's
     if found.still.any():
         write_image(work / "ignore.png", found.still.astype("uint8") * 255)
+    for name in ("refined.json", "refinement.json", "refinement.png"):  # they are of other poses, and would go before
+        (work / name).unlink(missing_ok=True)
     write_trajectory(work / "poses.json", found.trajectory)
     for line in lines:
         messages.say(f"{line[0].upper()}{line[1:]}.")

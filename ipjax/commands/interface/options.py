@@ -45,9 +45,14 @@ def check_output(path: Path, suffixes: tuple[str, ...]) -> Path:
 
 
 def check_folder(path: Path) -> Path:
-    """Refuse a folder that cannot be made, as `check_output`."""
-    if path.exists() and not path.is_dir():
-        raise ValueError(f"{path}: a file of this name is in the way")
+    """Refuse a folder that cannot be made or written to, as `check_output`."""
+    there = next((place for place in (path, *path.parents) if place.exists()), None)
+    if there is not None and not there.is_dir():
+        raise ValueError(
+            f"{path}: a file of this name is in the way" if there == path else f"{path}: {there} is a file"
+        )
+    if there is not None and not os.access(there, os.W_OK):
+        raise ValueError(f"{path}: the folder {there} cannot be written to")
     return path
 
 

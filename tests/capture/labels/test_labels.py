@@ -1,18 +1,24 @@
 """From a capture with poses to models and a BOP data set, as users go: ``ipjax capture model`` and ``label``."""
 
 import json
+from argparse import Namespace
 
 import numpy as np
 import pytest
 from builders.bop_roots import true_rows
 from builders.command_lines import run
+from PIL import Image
 
 from ipjax.bop.dataset import Dataset
 from ipjax.bop.results import write_results
 from ipjax.bop.scoring.scores import score
+from ipjax.capture.labels.dataset import write_dataset
+from ipjax.capture.labels.masks import FrameLabels
+from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.models.storing import read_models
 from ipjax.capture.records import Trajectory
 from ipjax.capture.trajectories import write_trajectory
+from ipjax.commands.capture.model import describe_inputs
 from ipjax.files.meshes.mesh import diameter
 from ipjax.synthetic.captures import make_capture, write_capture
 from ipjax.synthetic.objects import make_object
@@ -122,4 +128,46 @@ def test_what_is_wrong_is_said_in_a_sentence(work, tmp_path, capsys):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "letter.txt").write_text("keep me")
     assert run(["capture", "label", *words, "--dataset", str(tmp_path / "mine")]) == 2
+    assert run(["capture", "label", *words, "--dataset", str(tmp_path / "mine" / "letter.txt")]) == 2
+    assert run(["capture", "label", *words, "--dataset", str(tmp_path / "mine" / "letter.txt" / "inside")]) == 2
+    assert "letter.txt is a file" in capsys.readouterr().err
     assert (tmp_path / "mine" / "letter.txt").is_file()
+
+
+def test_what_others_made_is_not_replaced(work, tmp_path, capsys):
+    table, poses = str(work / "table"), (work / "work" / "poses.json").read_text()
+    assert run(["capture", "model", table, "-o", table, "--quiet"]) == 2
+    assert "would replace the capture's own files" in capsys.readouterr().err
+    # The folder of a BOP data set, whose models were made by someone else.
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "obj_000001.ply").write_text("keep me")
+    (tmp_path / "poses.json").write_text(poses)
+    assert run(["capture", "model", table, "-o", str(tmp_path), "--quiet"]) == 2
+    assert "has no models of ipjax capture" in capsys.readouterr().err
+    assert (tmp_path / "models" / "obj_000001.ply").read_text() == "keep me"
+
+
+def test_depth_beyond_the_form_is_unknown(tmp_path):
+    depth = np.full((4, 6), 1.2345, np.float32)
+    depth[0, 0], depth[0, 1] = 6.5535, 7.2
+    still = Similarity(np.eye(3), np.zeros(3), np.ones(()))
+    frame = PosedFrame("a", np.zeros((4, 6, 3), np.uint8), depth, depth > 0, np.diag([5.0, 5, 1]), still)
+    none = np.zeros((0, 4, 6), bool)
+    write_dataset(tmp_path / "dataset", [], [frame], [FrameLabels((), none, none, (), ())])
+    with Image.open(tmp_path / "dataset" / "test" / "000000" / "depth" / "000000.png") as image:
+        written = np.asarray(image)
+    assert written[0].tolist() == [65535, 0, 12345, 12345, 12345, 12345]
+
+
+def test_steps_are_kept_where_the_work_is_in_the_folder_of_the_capture(tmp_path):
+    table = tmp_path / "table"
+    (table / "rgb").mkdir(parents=True)
+    (table / "rgb" / "0.png").write_text("an image")
+    (table / "work").mkdir()
+    (table / "work" / "poses.json").write_text("{}")
+    words = Namespace(folder=table, form=None, camera=None, depth_scale=None, every=1)
+    before = describe_inputs(words, table / "work", {})
+    (table / "work" / "models.png").write_text("a picture")
+    assert describe_inputs(words, table / "work", {}) == before
+    (table / "rgb" / "1.png").write_text("another")
+    assert describe_inputs(words, table / "work", {}) != before

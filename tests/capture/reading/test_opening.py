@@ -198,6 +198,25 @@ def test_scenes_of_bop_with_their_cameras(made, tmp_path):
         open_capture(tmp_path)
 
 
+def test_two_images_of_one_name_are_refused(tmp_path):
+    colour, depth = np.zeros((6, 8, 3), np.uint8), np.full((6, 8), 700, np.uint16)
+    for form in ("numbered", "tum"):
+        (tmp_path / form).mkdir()
+        (tmp_path / form / "camera.json").write_text('{"fx": 8, "fy": 8, "cx": 3.5, "cy": 2.5}')
+    for ending in ("png", "jpg"):
+        save(tmp_path / "numbered" / f"frame-0.color.{ending}", colour)
+    save(tmp_path / "numbered" / "frame-0.depth.png", depth)
+    with pytest.raises(CaptureError, match="two files of one frame"):
+        open_capture(tmp_path / "numbered")
+    for name in ("left", "right"):
+        save(tmp_path / "tum" / name / "0.png", colour)
+    save(tmp_path / "tum" / "depth" / "0.png", depth)
+    (tmp_path / "tum" / "rgb.txt").write_text("1.0 left/0.png\n2.0 right/0.png\n")
+    (tmp_path / "tum" / "depth.txt").write_text("1.0 depth/0.png\n2.0 depth/0.png\n")
+    with pytest.raises(CaptureError, match="two of its images are called 0"):
+        open_capture(tmp_path / "tum")
+
+
 def without(name):
     return lambda here: shutil.rmtree(here / name) if (here / name).is_dir() else (here / name).unlink()
 
