@@ -155,6 +155,8 @@ def _write_scene(
 
 def _write_models(folder: Path, models: Sequence[ObjectModel]) -> None:
     infos = {}
+    for kind in ("models", "models_eval"):
+        (folder / kind).mkdir()
     for index, model in enumerate(models):
         mesh = model.mesh
         low, high = 1000 * mesh.vertices.min(0), 1000 * mesh.vertices.max(0)
@@ -165,7 +167,6 @@ def _write_models(folder: Path, models: Sequence[ObjectModel]) -> None:
             **model.symmetries.to_bop(),
         }
         for kind in ("models", "models_eval"):
-            (folder / kind).mkdir(exist_ok=True)
             save_mesh(move(mesh, np.eye(3), scale=1000.0), folder / kind / f"obj_{index + 1:06d}.ply")
     for kind in ("models", "models_eval"):
         write_text(folder / kind / "models_info.json", json.dumps(infos, indent=1))

@@ -61,7 +61,9 @@ class CaptureFrames(Sequence[PosedFrame]):
         places = {name: index for index, name in enumerate(trajectory.names)}
         missing = [name for name in capture.names if name not in places]
         if missing:
-            raise CaptureError(f"{capture.folder}: the poses lack frame {missing[0]} and {len(missing) - 1} more")
+            raise CaptureError(
+                f"{capture.folder}: there is no pose of {len(missing)} of its frames, first of {missing[0]}"
+            )
         self._capture, self._trajectory, self._improved = capture, trajectory, improved
         self._ignore = ignore
         self._rows = [

@@ -10,6 +10,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,7 @@ def write_models(folder: str | Path, models: SceneModels, made_of: str = "") -> 
     check_place(folder)
     with writing_folder(folder, replace=True) as inside:
         entries = []
-        for item in models.objects:
-            stem = file_name(item.name)
+        for item, stem in zip(models.objects, _choose_stems([item.name for item in models.objects]), strict=True):
             save_mesh(item.mesh, inside / f"{stem}.ply")
             seen = item.mesh.seen > 0
             save_points(
@@ -137,6 +137,18 @@ def _parse(folder: Path, entry: dict[str, Any]) -> ObjectModel:
     )
     name = Path(str(entry["file"])).name
     return ObjectModel(str(entry["name"]), load_mesh(folder / name), pose, symmetries)
+
+
+def _choose_stems(names: Sequence[str]) -> list[str]:
+    """Names of files for objects of these names: no two alike, and none that of the scene."""
+    taken, chosen = {"scene", "scene_points"}, []
+    for name in names:
+        stem = file_name(name)
+        while {stem, f"{stem}_points"} & taken:
+            stem += "_"
+        taken |= {stem, f"{stem}_points"}
+        chosen.append(stem)
+    return chosen
 
 
 def file_name(name: str) -> str:

@@ -42,9 +42,14 @@ class DepthForm:
 
     scale: float  # metres per number
     coded: bool = False  # the bits are turned by three places, as librealsense's first users stored them
+    floats: bool = False  # the numbers are floats, whose unit is another than that of whole numbers
 
-    def to_metres(self, depth: np.ndarray) -> np.ndarray:
-        """float32, metres, 0 = unknown."""
+    def read(self, path: Path) -> np.ndarray:
+        """float32, metres, 0 = unknown. Raises ValueError."""
+        depth = read_depth(path)
+        if (depth.dtype.kind == "f") != self.floats:
+            kinds = ("floats", "whole numbers") if depth.dtype.kind == "f" else ("whole numbers", "floats")
+            raise ValueError(f"{path}: depth of {kinds[0]} among depth of {kinds[1]}: they cannot have one unit")
         if self.coded:
             depth = turn_bits(depth)
         return to_metres(remove_sentinel(depth)[0], self.scale)
@@ -76,7 +81,7 @@ class FrameReader:
         _check_size(files.rgb, rgb, self.size)
         depth = np.zeros((height, width), np.float32)
         if files.depth is not None and self.depth is not None:
-            depth = self.depth.to_metres(read_depth(files.depth))
+            depth = self.depth.read(files.depth)
             _check_size(files.depth, depth, self.size)
         usable = np.ones((height, width), bool)
         if files.ignore is not None:
@@ -91,7 +96,7 @@ class FrameReader:
             usable = (shown > 0) & (inside[..., 0] > 0)
         raw = None
         if files.raw is not None and self.raw is not None and self.depth_size is not None:
-            raw = self.raw.to_metres(read_depth(files.raw))
+            raw = self.raw.read(files.raw)
             _check_size(files.raw, raw, self.depth_size)
             if self.depth_camera is not None and self.depth_camera.distortion:
                 blank = np.zeros((*raw.shape, 3), np.uint8)
@@ -224,7 +229,7 @@ def find_depth_form(
     except ValueError as error:
         said = str(error)
         raise CaptureError(said if str(path) in said else f"{path}: {said}") from None
-    return DepthForm(scale)
+    return DepthForm(scale, floats=depth.dtype.kind == "f")
 
 
 def is_coded(path: Path) -> bool:

@@ -51,6 +51,8 @@ def open_frames(folder: Path, *, camera: Any, depth_scale: float | int | None, p
             check_names(folder / kind, "the depth image" if kind == "depth" else "the raw depth image", names, images)
     intrinsics = pick_camera(folder, camera)
     ignored = list_images(folder / "ignore", COLOURS)
+    if ignored and not ignored.keys() & colours.keys():
+        raise CaptureError(f"{folder / 'ignore'}: {next(iter(ignored))} is the name of no frame, nor are the others")
     everywhere = folder / "ignore.png"
     files = [
         FrameFiles(

@@ -23,7 +23,8 @@ in metres; depth = features and their depth; structure = structure from motion, 
 one is described, else the poses given, else depth, and structure where that leaves frames out.
 
 Writes poses.json, tracks.npz (points recognised in several frames), trajectory.png, and ignore.png where something is
-found that moves with the camera. Exits with 1 where frames are left without a pose.
+found that moves with the camera; removes what ipjax capture refine made of earlier poses. Exits with 1 where frames are
+left without a pose.
 """
 
 

@@ -2,6 +2,7 @@
 
 import json
 from argparse import Namespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,11 +16,13 @@ from ipjax.bop.scoring.scores import score
 from ipjax.capture.labels.dataset import write_dataset
 from ipjax.capture.labels.masks import FrameLabels
 from ipjax.capture.models.frames import PosedFrame
-from ipjax.capture.models.storing import read_models
+from ipjax.capture.models.making import SceneModels
+from ipjax.capture.models.storing import read_models, write_models
+from ipjax.capture.models.support import Support
 from ipjax.capture.records import Trajectory
 from ipjax.capture.trajectories import write_trajectory
 from ipjax.commands.capture.model import describe_inputs
-from ipjax.files.meshes.mesh import diameter
+from ipjax.files.meshes.mesh import diameter, move
 from ipjax.synthetic.captures import make_capture, write_capture
 from ipjax.synthetic.objects import make_object
 from ipjax.synthetic.sensor import PERFECT
@@ -145,6 +148,21 @@ def test_what_others_made_is_not_replaced(work, tmp_path, capsys):
     assert run(["capture", "model", table, "-o", str(tmp_path), "--quiet"]) == 2
     assert "has no models of ipjax capture" in capsys.readouterr().err
     assert (tmp_path / "models" / "obj_000001.ply").read_text() == "keep me"
+
+
+def test_objects_of_any_name_have_files_of_their_own(work, tmp_path):
+    names = ("scene", "a b", "a_b", "../mug", "mug_points", "mug")
+    model = read_models(work / "work" / "models")[0]
+    objects = tuple(
+        replace(model, name=name, mesh=move(model.mesh, np.eye(3), scale=1.0 + k)) for k, name in enumerate(names)
+    )
+    support = Support(Similarity(np.eye(3), np.zeros(3), np.ones(())), np.zeros(2), np.ones((1, 1), bool), 1.0, 0.0)
+    write_models(tmp_path / "models", SceneModels(objects, model.mesh, support, ()))
+    again = read_models(tmp_path / "models")
+    assert tuple(item.name for item in again) == names
+    for item, true in zip(again, objects, strict=True):
+        np.testing.assert_allclose(item.mesh.vertices, true.mesh.vertices, atol=1e-6)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["models"]
 
 
 def test_depth_beyond_the_form_is_unknown(tmp_path):

@@ -244,6 +244,10 @@ def unscaled(here):
     (here / "camera.json").write_text(json.dumps(told))
 
 
+def masks_of_other_names(here):
+    save(here / "ignore" / "frame7.png", np.full((240, 320), 255, np.uint8))
+
+
 FAULTS = {
     "no rgb": (without("rgb"), "no capture is recognised"),
     "no camera": (without("camera.json"), "nothing says what the colour camera is"),
@@ -262,6 +266,7 @@ FAULTS = {
         rewritten("poses.json", lambda t: json.dumps({k: np.diag([1, 1, -1, 1]).tolist() for k in json.loads(t)})),
         "000000: the matrix mirrors",
     ),
+    "masks of no frame": (masks_of_other_names, "frame7 is the name of no frame"),
     "no matrix": (
         rewritten(
             "depth_camera.json",
@@ -287,6 +292,10 @@ def test_a_frame_that_breaks_later_is_named(folder, tmp_path):
     (here / "depth" / "000001.png").unlink()
     with pytest.raises(CaptureError, match=r"000001\.png: no such file"):
         capture.read_frame(1)
+    np.save(here / "depth" / "000001.npy", np.full((240, 320), 0.7, np.float32))
+    with pytest.raises(CaptureError, match=r"000001\.npy: depth of floats among depth of whole numbers"):
+        open_capture(here).read_frame(1)
+    (here / "depth" / "000001.npy").unlink()
     faults: dict[str, dict[str, Any]] = {
         "no form": {"form": "other"},
         "every 0-th": {"every": 0},
