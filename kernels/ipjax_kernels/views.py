@@ -68,10 +68,11 @@ def draw_view(
     """
     rays = _rays(height, width, focal, centre)
 
-    def guess(*one):
+    def guess(depth, rotation, translation, weight):
         """A source's guesses, put where the view's rays meet what it measured: splats are of whole pixels."""
+        one = depth, rotation, translation, weight
         alone = sources._replace(**{name: part[None] for name, part in zip(_OF_EACH, one, strict=True)})
-        carried = _carry(*one, sources, focal, centre, height, width)
+        carried = _carry(depth, rotation, translation, weight, sources, focal, centre, height, width)
         meet = jax.vmap(lambda z: jnp.where(z > 0, _look(z, rays, alone, rules, focal).depth[0], 0))
         return lax.fori_loop(0, _REFINEMENTS, lambda _, z: meet(z), carried)
 

@@ -127,7 +127,9 @@ def _draw_cameras(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1
     )
     poses = look_from(at + distance[:, None] * backwards, at, np.array([0.0, 0, 1]))
-    wobble = Similarity.exp(np.concatenate([rng.normal(0, [0.03, 0.03, 0.08], (views, 3)), np.zeros((views, 3))], 1))
+    wobble = Similarity[np.ndarray].exp(
+        np.concatenate([rng.normal(0, [0.03, 0.03, 0.08], (views, 3)), np.zeros((views, 3))], 1)
+    )
     return poses @ wobble
 
 

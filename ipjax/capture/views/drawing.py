@@ -58,7 +58,10 @@ def draw_views(
         raise ValueError(f"new views need two frames or more, not {len(frames)}")
     read = lru_cache(_KEPT)(frames.__getitem__)
     first = read(0)
-    K, size = first.camera if K is None else K, first.size if size is None else size
+    if K is None:
+        K = first.camera
+    if size is None:
+        size = first.size
     points = sample_scene(frames)
     if not len(points):
         raise ValueError("no frame has depth: there is nothing to draw")

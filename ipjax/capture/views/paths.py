@@ -43,7 +43,7 @@ def smooth_path(captured: Similarity[np.ndarray], count: int) -> Similarity[np.n
         pose = _repeat(_take(captured, a), _FINE)
         for step, (first, second) in enumerate(((a, b), (b, c), (c, d))):
             motion = (_take(captured, first).inverse() @ _take(captured, second)).log()[:6]
-            pose = pose @ Similarity.exp(done[:, step, None] * motion)
+            pose = pose @ Similarity[np.ndarray].exp(done[:, step, None] * motion)
         fine.append(pose)
     fine.append(_repeat(_take(captured, known - 1), 1))
     path = _join(fine)
@@ -55,7 +55,7 @@ def smooth_path(captured: Similarity[np.ndarray], count: int) -> Similarity[np.n
     place = np.clip(np.searchsorted(along, wanted, side="right") - 1, 0, len(lengths) - 1)
     rest = (wanted - along[place]) / np.maximum(lengths[place], 1e-12)
     motion = _take(turned, place).log()[:, :6]
-    return _upright(_take(path, place) @ Similarity.exp(np.clip(rest, 0, 1)[:, None] * motion))
+    return _upright(_take(path, place) @ Similarity[np.ndarray].exp(np.clip(rest, 0, 1)[:, None] * motion))
 
 
 def orbit_path(captured: Similarity[np.ndarray], middle: Float[np.ndarray, "3"], count: int) -> Similarity[np.ndarray]:

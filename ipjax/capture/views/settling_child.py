@@ -61,6 +61,7 @@ def main(folder: Path) -> None:
             data.qpos[slots[i]] = [*job["parked"][i], 1, 0, 0, 0]
             data.qvel[speeds[i]] = 0
 
+    quiet = 0.0
     for number in range(count):
         heights = [top(model, data, i) for i in range(number)]
         floor = max(heights, default=0.0)

@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         messages.finish({"dataset": str(root), "made": False})
         return 0
     poses = [frame.world_from_camera.to_matrix() for frame in frames]
-    captured = Similarity.from_matrix(np.stack(poses))
+    captured = Similarity[np.ndarray].from_matrix(np.stack(poses))
     count = arguments.count or 36
     if given is not None:
         path = given
