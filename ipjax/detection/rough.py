@@ -78,9 +78,10 @@ def mend_mask(
         return None
     about = detector.estimator, detector.detection, detector.options, sight.scene, sight.watch
     verifier = Verifier(*about, diameter=diameter, seed=seed)
-    first = verifier.attempt(Candidate(index, NONE, 0.0, given, crop), where=GIVEN)
+    whole = Candidate(index, NONE, 0.0, given, crop)
+    first = verifier.attempt(whole, where=GIVEN, drawn=True)  # as the poses that it is compared with in the end
     others = [verifier.attempt(one) for one in detector.rank(sight, index, TRIED, lambda mask: _is_like(mask, given))]
-    claims = verifier.settle([first, *others], 1)
+    claims = verifier.settle([verifier.attempt(whole, where=GIVEN), *others], 1)
     rate = lambda claim: claim.value * _cover(claim.mask, given)
     best = max(claims, key=rate, default=None)
     mask, value = _pose_mask(first.result, given, sight.scene, detector.detection), first.value

@@ -98,14 +98,22 @@ class Verifier:
         return self._claims(found)
 
     def attempt(
-        self, candidate: Candidate, stage: str = "verify", where: str = PROPOSAL, earlier: tuple[Step, ...] = ()
+        self,
+        candidate: Candidate,
+        stage: str = "verify",
+        where: str = PROPOSAL,
+        earlier: tuple[Step, ...] = (),
+        *,
+        drawn: bool = False,
     ) -> Trial:
-        """Estimate a candidate; ``stage`` is what the seconds are counted as, ``where`` what was cut out, in words."""
+        """Estimate a candidate; ``stage`` is what the seconds are counted as, ``where`` what was cut out, in words.
+
+        Which pieces of a frame are worth a second look shows without drawing; what is told is ``drawn``. Confidences
+        of one kind are not to be compared with those of the other.
+        """
         crop = candidate.crop
         patches = describe_crop(self.estimator, crop, self.watch)
         about = crop.view, crop.camera_from_crop
-        # Which pieces of a frame are worth a second look shows without drawing; what is told was drawn.
-        drawn = where == POSED
         with self.watch(stage):
             result = self.estimator.run(candidate.index, *about, seed=self.seed, patches=patches, drawn=drawn)
         self.watch.move("compile", result.seconds.get("compile", 0.0), stage)
@@ -148,7 +156,7 @@ class Verifier:
                 else:
                     again = dataclasses.replace(trial.candidate, crop=crop)
                     earlier = *trial.earlier, trial.as_step(mask)
-                    mended.append(self.attempt(again, "verify again", POSED, earlier))
+                    mended.append(self.attempt(again, "verify again", POSED, earlier, drawn=True))
         return mended
 
     def _is_same(self, trial: Trial, other: Trial) -> bool:

@@ -6,6 +6,7 @@ from builders.detections import MATRIX, detector, make_frame, place
 from builders.tiny_pipeline import assert_near
 
 from ipjax.detection.assignment import overlap
+from ipjax.detection.crops import cut_crop
 from ipjax.detection.rough import mend_mask
 
 
@@ -27,6 +28,10 @@ def test_masks_that_are_wrong_come_out_as_the_object():
         assert (mended.added > mended.removed) == (given is half)
         assert_near(mended.result.estimate.camera_from_object, frame.poses[0], 0.08, 0.1, 20)
     again = mend_mask(sought, 0, sight, half)
+    crop = cut_crop(sight.scene, half, **sought.options)
+    assert again is not None and crop is not None
+    plain = sought.estimator.run(0, crop.view, crop.camera_from_crop)  # as it is told without mending
+    assert float(again.first.estimate.confidence) == float(plain.estimate.confidence)
     assert again is not None and again.used and again.proposal in sight.rankings[0].proposals
 
 
