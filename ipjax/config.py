@@ -4,6 +4,7 @@ A field marked ``static`` fixes a shape or picks a code path; changing it compil
 be swept without a second trace. ``Config()`` is the best known so far, ``Config.paper()`` the paper's method.
 """
 
+import dataclasses
 from typing import Literal
 
 import equinox as eqx
@@ -207,6 +208,10 @@ class DetectConfig(eqx.Module):
     # given ones (``python -m benchmarks.detection_confidence``).
     drawn: tuple[float, ...] = (1.36, 0.85, 1.91, 3.08, 6.07, 0.0, -1.76)
     instances: int = _static(8, least=1)  # most instances of an object where all are asked for
+
+    def with_confidence(self, config: Config) -> Config:
+        """Settings of estimates in masks that were found, with the confidence of detections."""
+        return dataclasses.replace(config, confidence=dataclasses.replace(config.confidence, drawn=self.drawn))
 
 
 PRESETS = ("default", "fast", "paper")

@@ -160,6 +160,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Estimate, print and draw; returns the exit status, 1 where no object is present in any frame."""
     frames = list_frames(arguments)
     check(arguments)
+    from ipjax.config import DetectConfig
     from ipjax.files.objects.loading import load
     from ipjax.files.weights.matching import load_matching_encoder
     from ipjax.inference.compilation_cache import use_compilation_cache
@@ -180,11 +181,13 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.inference.estimator import Estimator
     from ipjax.inference.reports import CONVENTIONS, to_json
 
+    sought = any(is_without_masks(files) for files in frames if not files.error)
+    if sought:  # in all frames or in none
+        config = DetectConfig().with_confidence(config)
     estimator = Estimator(
         objects, encoder, config, quick=not many, crop=arguments.crop, depth_scale=arguments.depth_scale
     )
     detector = None
-    sought = any(is_without_masks(files) for files in frames if not files.error)
     if sought or arguments.mask_is_rough:
         detector = make_detector(objects, encoder, quick=not many, crop=arguments.crop)
     entries: list[dict[str, Any]] = []

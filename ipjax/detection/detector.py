@@ -48,7 +48,8 @@ class Detector:
         objects: templates and what is known of them, as `ipjax.load` returns them. Of each, ``detection.views``
             templates are used, and kept in memory: with an iterator that loads them, no more than that and one object.
         encoder: made the templates' features.
-        config: of the estimates that verify proposals; None = `Config.fast`.
+        config: of the estimates that verify proposals; None = `Config.fast`. Its ``confidence.drawn`` is that of
+            ``detection``.
         detection: how objects are sought.
         proposals: how a frame is cut up; None = as by default.
         quick: as `ipjax.Estimator` has it.
@@ -74,8 +75,7 @@ class Detector:
             raise ValueError(f"the objects' templates have {' and '.join(map(str, sizes))} pixels: detect them apart")
         self.detection = detection
         self.proposals = proposals
-        config = Config.fast() if config is None else config
-        config = dataclasses.replace(config, confidence=dataclasses.replace(config.confidence, drawn=detection.drawn))
+        config = detection.with_confidence(Config.fast() if config is None else config)
         self.estimator = Estimator(thinned, encoder, config, quick=quick, alike=True, **options)
         self.options = {"resolution": sizes[0]} | self.estimator.options
         self.zoom = _usable_zoom(thinned[0][0], sizes[0], detection.zoom)

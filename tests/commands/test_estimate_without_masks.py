@@ -16,8 +16,11 @@ from builders.tiny_pipeline import DRAWN
 from PIL import Image
 
 from ipjax.commands.interface import options
+from ipjax.config import DetectConfig
+from ipjax.estimation.confidence import probability
 from ipjax.files.images.run_lengths import decode_rle
 from ipjax.files.objects.saving import save
+from ipjax.records import Agreement
 from ipjax.synthetic.problems import CoordinateEncoder, make_encoder
 
 
@@ -90,8 +93,12 @@ def test_a_page_explains_what_was_found_and_what_was_not(scene, capfd):
     # The frame with the object drawn into it, and with the proposals; then crops, all of one size.
     assert pictures[0].shape[0] == pictures[1].shape[0] == 900
     assert {picture.shape for picture in pictures[2:]} == {(160, 160, 3)}
-    # Estimated with the settings that were asked for, in the mask that was found.
-    assert one["detected"]["steps"][-1]["where"].endswith("settings asked for")
+    # Estimated with the settings that were asked for, in the mask that was found; with the confidence of detections.
+    last = one["detected"]["steps"][-1]
+    assert last["where"].endswith("settings asked for")
+    assert (last["score"], last["confidence"]) == (one["detected"]["score"], one["confidence"])
+    agreement = Agreement(**{name: np.float32(value) for name, value in one["agreement"].items()})
+    assert one["confidence"] == pytest.approx(float(probability(agreement, np.array(DetectConfig().drawn))), abs=1e-5)
 
 
 def read_picture(code: str) -> np.ndarray:

@@ -134,8 +134,9 @@ def _estimate_again(
         given = {"seed": arguments.seed, "diameter": diameters[one.index]}
         result = estimator.run(one.index, crop.view, crop.camera_from_crop, **given)
         step = Step.of("that mask, with the settings asked for", one.mask, result, _score(result))
-        found.append(dataclasses.replace(one, result=result, steps=(*one.steps, step)))
+        found.append(dataclasses.replace(one, result=result, score=step.score, steps=(*one.steps, step)))
         seconds[id(found[-1])] = spent
+    found.sort(key=lambda one: -one.score)
     return dataclasses.replace(detections, found=tuple(found), rejected=(*rejected, *lost)), seconds
 
 
