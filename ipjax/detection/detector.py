@@ -266,7 +266,7 @@ class Detector:
         masks = sight.proposals.masks
         left = [i for i in range(len(mine)) if np.isfinite(mine[i]) and (fits is None or fits(masks[i]))]
         order = np.array(left, int)[np.argsort(-mine[left], kind="stable")]
-        most = max(settings.shortlist, count)
+        most = max(settings.shortlist, min(count, len(masks) + -len(masks) % _BUCKET))
         best = [int(i) for i in order[:most]]
         if best:
             found = [self._signature(sight, proposal) for proposal in best]

@@ -70,6 +70,13 @@ def test_every_step_is_told():
     assert len(kept) + len(rejected) == len(found) + len(found.rejected)
 
 
+def test_no_more_is_ranked_than_was_proposed():
+    frame, sought = make_frame(place(-0.12, 0.05)), detector()
+    sight = sought.look(frame.rgb, frame.depth, MATRIX, at=[(114.5, 138.5)])
+    candidates = sought.rank(sight, 0, 10**12)  # as many instances may be asked for as one likes
+    assert sorted(one.proposal for one in candidates) == sight.used.tolist()
+
+
 def test_a_click_tells_which_of_two():
     frame, sought = make_frame(place(-0.15, 0.0, seed=1), place(0.15, 0.02, seed=2)), detector()
     mask = frame.masks[1]
