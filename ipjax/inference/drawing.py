@@ -168,8 +168,9 @@ def draw_overlay(
 
 
 def name_estimate(name: str, estimate: PoseEstimate) -> str:
-    """The label of an object in a picture: its name, its confidence, and whether it is only a guess."""
-    return f"{name} {float(estimate.confidence):.2f}" + ("" if bool(estimate.present) else ", a guess")
+    """The label of an object in a picture, in one line: its name, its confidence, and whether it is only a guess."""
+    guess = "" if bool(estimate.present) else ", a guess"
+    return f"{' '.join(name.split())} {float(estimate.confidence):.2f}{guess}"
 
 
 def draw_mask(

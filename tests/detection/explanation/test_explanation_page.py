@@ -109,6 +109,7 @@ def test_pictures_show_what_they_are_of():
     plain = draw_found(found.scene, [])
     shown = draw_found(found.scene, found.told()[0])
     assert shown.shape == plain.shape == (900, 1200, 3)
+    assert draw_found(found.scene, [detection(0, "a name\nof two lines")]).shape == plain.shape
     inside = cv2.dilate(cv2.resize(FRAME.masks[0].astype(np.uint8), (1200, 900)), np.ones((9, 9))) > 0
     assert np.abs(shown.astype(int) - plain)[inside].mean() > 5
     masks = found.proposals.masks
