@@ -7,9 +7,9 @@ For each image of a data set in BOP layout, every object for which the folder ha
 * the annotated masks made wrong (widened, eroded, half of it missing, a fifth of a neighbour added), with and without
   ``--mask-is-rough``.
 
-A line for each image is kept in --output: killed and called again it goes on, unless the code or the settings are
-others. ``--page`` writes the page from these lines. Seconds are of the processor, of all threads; what is compiled
-before the first image does not count.
+A line for each image is kept in --output: killed and called again it goes on, unless the code, the object files or the
+settings are others. ``--page`` writes the page from these lines. Seconds are of the processor, of all threads; what is
+compiled before the first image does not count.
 """
 
 import argparse
@@ -34,7 +34,8 @@ from ipjax.detection.detector import Detector
 from ipjax.detection.rough import mend_mask
 from ipjax.files.objects.loading import load
 from ipjax.files.provenance import hash_executed
-from ipjax.files.storage.writing import append_json, write_text
+from ipjax.files.storage.parsing import parse_json
+from ipjax.files.storage.writing import append_json, read_lines, write_text
 from ipjax.files.weights.encoder import load_encoder
 from ipjax.inference.compilation_cache import use_compilation_cache
 from ipjax.progress import bar
@@ -352,6 +353,7 @@ def main(arguments: list[str] | None = None) -> None:
             "data": dataset.name,
             "path": path.name,
             "objects": len(bench.objects),
+            "files": [info.content_sha256[:16] for _, info in bench.detector.estimator.objects],
             "views": detection.views,
             "encoder": encoder.identity,
             "code": hash_executed("ipjax.detection.detector", also=("ipjax.detection.rough",)),
@@ -373,8 +375,8 @@ def main(arguments: list[str] | None = None) -> None:
 def measure(bench: Bench, head: dict[str, Any], path: Path) -> list[dict[str, Any]]:
     """A line for each image; those that were made by the same code and settings are read, the others made."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    same = lambda one: all(one.get(key) == head[key] for key in ("code", "views", "encoder", "objects"))
-    kept = [json.loads(line) for line in path.read_text().splitlines()] if path.is_file() else []
+    same = lambda one: all(one.get(key) == head[key] for key in ("code", "views", "encoder", "files"))
+    kept = [parse_json(line) for line in read_lines(path, repair=True)] if path.is_file() else []
     if not kept or not same(kept[0]):
         write_text(path, json.dumps(head) + "\n")
         kept = [head]

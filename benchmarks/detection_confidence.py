@@ -144,8 +144,8 @@ def _tell(claim: Any, index: int, points: np.ndarray, truth: Any) -> dict[str, A
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The lines of scenes, in their order; none where there is no file yet."""
-    return [parse_json(line) for line in read_lines(path)] if path.is_file() else []
+    """The lines of scenes, in their order; none where there is no file yet. One that was cut short is cut off."""
+    return [parse_json(line) for line in read_lines(path, repair=True)] if path.is_file() else []
 
 
 def collect(rows: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
