@@ -73,9 +73,7 @@ def _shrink_depth(depth: np.ndarray, width: int, height: int) -> Float[np.ndarra
     rows = ((np.arange(height) + 0.5) * depth.shape[0] / height).astype(int)
     columns = ((np.arange(width) + 0.5) * depth.shape[1] / width).astype(int)
     picked = depth[rows[:, None], columns].astype(np.float32)
-    for dy, dx in ((0, -1), (-1, 0), (-1, -1)):
-        if width >= depth.shape[1]:
-            break
+    for dy, dx in ((0, -1), (-1, 0), (-1, -1)) if width < depth.shape[1] else ():
         other = depth[np.maximum(rows + dy, 0)[:, None], np.maximum(columns + dx, 0)]
         picked = np.where(picked > 0, picked, other)
     return np.ascontiguousarray(picked, np.float32)

@@ -44,7 +44,8 @@ def grow_tree(
       largest: joins of more than this share of the frame are not made.
     """
     total = segments.area.sum()
-    area, lab, normal = list(segments.area), list(segments.lab), list(segments.normal)
+    area = list(segments.area)
+    lab, normal = [tuple(x) for x in segments.lab.tolist()], [tuple(x) for x in segments.normal.tolist()]
     steps = np.stack([segments.length, border["jump"], border["crease"], border["contrast"]], -1)
     neighbours: list[dict[int, np.ndarray]] = [{} for _ in area]
     for (a, b), step in zip(segments.pairs.tolist(), steps, strict=True):
@@ -61,7 +62,6 @@ def grow_tree(
         cost = cost / length + affinity.bend * bend + affinity.colour * colour / 35
         return (cost + 0.02) * (min(area[a], area[b]) / total) ** affinity.size
 
-    lab, normal = [tuple(x) for x in segments.lab.tolist()], [tuple(x) for x in segments.normal.tolist()]
     alive = [True] * len(area)
     queue = [(unlike(a, b), a, b) for a in range(len(area)) for b in neighbours[a] if a < b]
     heapq.heapify(queue)
