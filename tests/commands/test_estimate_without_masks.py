@@ -8,6 +8,7 @@ import re
 
 import cv2
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from builders import detections
@@ -97,8 +98,8 @@ def test_a_page_explains_what_was_found_and_what_was_not(scene, capfd):
     last = one["detected"]["steps"][-1]
     assert last["where"].endswith("settings asked for")
     assert (last["score"], last["confidence"]) == (one["detected"]["score"], one["confidence"])
-    agreement = Agreement(**{name: np.float32(value) for name, value in one["agreement"].items()})
-    assert one["confidence"] == pytest.approx(float(probability(agreement, np.array(DetectConfig().drawn))), abs=1e-5)
+    agreement = Agreement(**{name: jnp.float32(value) for name, value in one["agreement"].items()})
+    assert one["confidence"] == pytest.approx(float(probability(agreement, jnp.array(DetectConfig().drawn))), abs=1e-5)
 
 
 def read_picture(code: str) -> np.ndarray:
