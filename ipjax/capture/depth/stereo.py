@@ -1,14 +1,14 @@
 """Stereo between the colour images of a capture: depth that owes nothing to the depth camera."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from ipjax_kernels.depth.sweep import sweep
 from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from ipjax.cameras import project, resize, unproject
+from ipjax.cameras import resize, unproject
 from ipjax.capture.records import Capture, CaptureFrame, Trajectory
 from ipjax.transforms import Similarity
 
@@ -184,30 +184,3 @@ def _keep_patches(depth, sure, radius):
     high = ndimage.maximum_filter(np.where(sure, depth, 0), 2 * radius + 1)
     low = ndimage.minimum_filter(np.where(sure, depth, np.inf), 2 * radius + 1)
     return sure & (share > 0.8) & (high - low < 0.06 * depth)
-
-
-def keep_consistent(
-    views: Views, found: Sequence[StereoDepth], *, tolerance: float = 0.01, least: int = 1
-) -> list[StereoDepth]:
-    """Depth that neighbours' own stereo sees, too: what is sure stays so only if ``least`` of them agree.
-
-    Args:
-      found: of every view.
-      tolerance: of depth: how far two may differ.
-    """
-    kept = []
-    for place, own in enumerate(found):
-        points = views.lift(own.depth).reshape(-1, 3)
-        world = views.pose(place) @ points
-        agree = np.zeros(len(points), int)
-        for other in choose_neighbours(views, place)[0]:
-            moved = views.pose(other).inverse() @ world
-            column, row = np.round(project(views.K, moved)).astype(int).T
-            width, height = views.size
-            inside = (moved[:, 2] > 0.05) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
-            there = found[other].depth[row, column]
-            agree += inside & (np.abs(there - moved[:, 2]) < tolerance * moved[:, 2])
-        seen = (agree >= least).reshape(own.depth.shape)
-        kept.append(dataclasses.replace(own, sure=own.sure & seen))
-    return kept
