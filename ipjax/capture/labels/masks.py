@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull
 
 from ipjax.bop.detections import box_of
-from ipjax.cameras import crop, project
+from ipjax.cameras import crop, project, unproject
 from ipjax.capture.labels.borders import snap
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.models.making import ObjectModel
@@ -17,6 +18,7 @@ from ipjax.transforms import Similarity
 
 _HIDES = 0.015  # metres by which what is measured must be nearer than the model to hide it
 _BATCH = 240  # images that are drawn at once
+_EXACT = 0.002  # metres by which depth of a model's own surface may be outside of its hull
 _BEHIND = 0.02  # … or farther for the model not to be there
 
 
@@ -112,7 +114,8 @@ def _label_batch(
         whole = silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width]
         ids, drawn = together.ids[number], together.depth[number]
         if not exact:
-            ids = snap(frame.rgb, settle(ids, drawn, frame), len(models), frame.usable)
+            heard = settle(ids, drawn, frame, models, poses[number])
+            ids = snap(frame.rgb, heard, len(models), frame.usable)
         visible = np.stack([ids == k for k in range(len(models))])
         whole, silhouettes = whole | visible, silhouettes.copy()
         silhouettes[:, rim[1] : rim[1] + height, rim[0] : rim[0] + width] |= visible
@@ -132,18 +135,40 @@ def _label_batch(
     return found
 
 
-def settle(ids: np.ndarray, drawn: Float[np.ndarray, "h w"], frame: PosedFrame) -> np.ndarray:
+def settle(
+    ids: np.ndarray,
+    drawn: Float[np.ndarray, "h w"],
+    frame: PosedFrame,
+    models: Sequence[ObjectModel],
+    camera_from_model: Sequence[Similarity[np.ndarray]],
+) -> np.ndarray:
     """Which model each pixel shows, −1 = none, where the frame has been heard: what is measured in front hides, what is
     measured far behind shows that the model is not there.
+
+    What is measured in front, but inside the model's hull, is a part of it that the model lacks: through the hole its
+    far side is drawn.
     """
     import cv2
 
     known = (frame.depth > 0) & (ids >= 0)
     kernel = np.ones((3, 3), np.uint8)
+    before = known & (frame.depth < drawn - _HIDES)
+    for index, (model, pose) in enumerate(zip(models, camera_from_model, strict=True)):
+        rows, columns = np.nonzero(before & (ids == index))
+        if len(rows):
+            pixels = np.stack([columns, rows], axis=-1).astype(float)
+            points = unproject(frame.camera, pixels, frame.depth[rows, columns].astype(float))
+            before[rows, columns] = ~_is_inside(model.mesh.vertices, pose.inverse() @ points)
     # Single pixels are noise, and those beside an edge may have the depth of either side.
-    hidden = cv2.morphologyEx((known & (frame.depth < drawn - _HIDES)).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
+    hidden = cv2.morphologyEx(before.astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
     absent = cv2.morphologyEx((known & (frame.depth > drawn + _BEHIND)).astype(np.uint8), cv2.MORPH_OPEN, kernel) > 0
     return np.where(hidden | absent | ~frame.usable, -1, ids)
+
+
+def _is_inside(vertices: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
+    """Whether points are in the convex hull, or as near to it as depth is exact."""
+    planes = ConvexHull(vertices).equations
+    return (points @ planes[:, :3].T + planes[:, 3] <= _EXACT).all(axis=1)
 
 
 def find_box(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:
