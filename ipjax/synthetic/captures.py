@@ -210,7 +210,8 @@ def _write_image(path: Path, image: np.ndarray) -> None:
 
 
 def _in_units(depth: np.ndarray) -> np.ndarray:
-    return np.clip(np.round(depth / DEPTH_UNIT), 0, 65535).astype(np.uint16)
+    units = np.round(depth / DEPTH_UNIT)
+    return np.where(units <= 65535, units, 0).astype(np.uint16)  # farther is not known, rather than nearer
 
 
 def _describe(camera: Camera, size: tuple[int, int]) -> dict:

@@ -212,7 +212,9 @@ def _make_frame(maker: DepthMaker, index: int, name: str, work: Path, mode: str,
     _save(work / "rgb" / f"{name}.png", frame.rgb)
     _save(work / "confidence" / f"{name}.png", np.round(255 * found.confidence).astype(np.uint8))
     _save(work / "depth_pictures" / f"{name}.jpg", draw_depths(frame.rgb, factory, found.depth, found.confidence))
-    _save(work / "depth" / f"{name}.png", np.clip(np.round(found.depth / UNIT), 0, 65535).astype(np.uint16))
+    units = np.round(found.depth / UNIT)
+    # What is farther than an image can say is not known, rather than nearer.
+    _save(work / "depth" / f"{name}.png", np.where(units <= 65535, units, 0).astype(np.uint16))
     return float((found.depth > 0).mean())
 
 
