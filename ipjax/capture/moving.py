@@ -63,12 +63,12 @@ def find_moving_in(
     # Specks are chance; gaps between what was found are noise.
     stays = np.asarray(ndimage.binary_opening(np.pad(stays, 2, mode="edge"), iterations=1))[2:-2, 2:-2]
     stays = np.asarray(ndimage.binary_closing(np.pad(stays, 4, mode="edge"), iterations=3))[4:-4, 4:-4]
-    labels, count = ndimage.label(stays)
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    begun = np.bincount(labels.ravel(), weights=seeds.ravel(), minlength=count + 1)
+    count, labels = cv2.connectedComponents(stays.astype(np.uint8), connectivity=4)
+    sizes = np.bincount(labels.ravel(), minlength=count)
+    begun = np.bincount(labels.ravel(), weights=seeds.ravel(), minlength=count)
     large = (sizes >= LEAST * stays.size) & (begun >= SEEDS * sizes)
     large[0] = False
-    found = large[labels]
+    found = large[np.asarray(labels, int)]
     if not found.any():
         return nowhere
     whole = cv2.resize(found.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)

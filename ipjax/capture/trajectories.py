@@ -90,7 +90,7 @@ def to_rigid(matrices: np.ndarray) -> Similarity[np.ndarray]:
     Raises:
       ValueError: they are not finite, or stretch, shear or mirror, by a thousandth or more.
     """
-    pose = Similarity.from_matrix(np.asarray(matrices, np.float64))
+    pose = Similarity[np.ndarray].from_matrix(np.asarray(matrices, np.float64))
     if np.abs(pose.scale - 1).max(initial=0) > 1e-3:
         worst = float(pose.scale[np.abs(pose.scale - 1).argmax()])
         raise ValueError(f"a camera's pose keeps sizes, but one of these enlarges by {worst:.4g}")

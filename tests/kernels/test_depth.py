@@ -86,7 +86,7 @@ def test_propagation_finds_a_shift_and_its_cost_is_the_twins():
     estimated, turned = np.roll(captured, (-2, 3), (0, 1)), np.roll(normals, (-2, 3), (0, 1))
     estimated = np.where(rng.uniform(size=estimated.shape) < 0.9, estimated, 0).astype(np.float32)
     offsets, cost = propagate_offsets(
-        jax.random.key(0), estimated, turned, captured, normals, reach=6.0, unit=0.02, angle=0.5
+        estimated, turned, captured, normals, jax.random.key(0), reach=6.0, unit=0.02, angle=0.5
     )
     offsets, cost = np.asarray(offsets), np.asarray(cost)
     right = (offsets[6:-6, 6:-6] == [-3, 2]).all(-1)

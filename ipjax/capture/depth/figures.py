@@ -24,7 +24,7 @@ class Figures:
     edge_contrast: float  # how much steeper the colours are where depth jumps than beside, 1 = not at all
 
     def tell(self) -> str:
-        """In words."""
+        """The figures in words, for the report of a step."""
         number = lambda value, unit: "unknown" if value != value else f"{1e3 * value:.1f} {unit}"
         contrast = "unknown" if self.edge_contrast != self.edge_contrast else f"{self.edge_contrast:.2f} times"
         return (

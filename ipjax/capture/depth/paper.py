@@ -49,11 +49,11 @@ def align_as_paper(
     scale, agreement = find_scale(captured, estimated, seed=seed)  # 1
     scaled = scale * estimated
     offsets, cost = propagate_offsets(  # 2 to 8
-        jax.random.key(seed),
         scaled.astype(np.float32),
         find_normals(scaled, K).astype(np.float32),
         captured.astype(np.float32),
         find_normals(captured, K).astype(np.float32),
+        jax.random.key(seed),
         reach=REACH * captured.shape[1],
         unit=_UNIT,
     )

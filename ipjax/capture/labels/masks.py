@@ -168,7 +168,7 @@ def settle(
 def _is_inside(vertices: Float[np.ndarray, "n 3"], points: Float[np.ndarray, "m 3"]) -> Bool[np.ndarray, " m"]:
     """Whether points are in the convex hull, or as near to it as depth is exact."""
     planes = ConvexHull(vertices).equations
-    return (points @ planes[:, :3].T + planes[:, 3] <= _EXACT).all(axis=1)
+    return np.asarray((points @ planes[:, :3].T + planes[:, 3] <= _EXACT).all(axis=1))
 
 
 def find_box(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int]:

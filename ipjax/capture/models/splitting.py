@@ -44,6 +44,7 @@ class Affinity:
         return len(self.area)
 
     def laplacian(self) -> sparse.csc_matrix:
+        """Of the graph, its edges by their weights."""
         a, b = self.edges.T
         graph = sparse.coo_matrix(
             (np.tile(self.weight, 2), (np.concatenate([a, b]), np.concatenate([b, a]))), (self.count, self.count)

@@ -96,7 +96,7 @@ def sample_depth(depth: Float[np.ndarray, "h w"], pixel: Float[np.ndarray, "n 2"
     height, width = depth.shape
     depth = np.where(np.isfinite(depth), depth, 0)
     padded = np.pad(depth, 2)  # with what is unknown
-    inside = ((pixel > -0.5) & (pixel < np.array([width, height]) - 0.5)).all(1)
+    inside = np.asarray(((pixel > -0.5) & (pixel < np.array([width, height]) - 0.5)).all(1))
     pixel = np.where(inside[:, None], pixel, 0)
     x, y = np.round(pixel).astype(int).T
     rows, columns = (axis.reshape(-1) for axis in np.mgrid[-2:3, -2:3])
@@ -237,6 +237,7 @@ def find_still(
     Returns:
       True where it is, with a margin; nowhere for most captures.
     """
+    import cv2
     from scipy import ndimage
 
     width, height = size
@@ -261,7 +262,7 @@ def find_still(
     # Padded, so that what reaches the border stays there; closed, because between its points it is there, too.
     seen_often = np.pad(votes >= max(3, 0.2 * len(features)), 24)
     closed = np.asarray(ndimage.binary_closing(seen_often, iterations=24))[24:-24, 24:-24]
-    labels, _ = ndimage.label(closed)
+    _, labels = cv2.connectedComponents(closed.astype(np.uint8), connectivity=4)
     mask = np.zeros((height, width), bool)
     for index, (rows, columns) in enumerate(ndimage.find_objects(labels), start=1):
         if max(rows.stop - rows.start, columns.stop - columns.start) >= 30:

@@ -37,7 +37,7 @@ def model(job: Job) -> Outcome:
     if left > job.settings.models.least_area:
         warnings.append(
             f"{1e4 * left:.0f} cm² of surface above the table belong to no object: something seen from too few "
-            "sides, or not down to the table; --click NAME:X,Y on it makes it one."
+            "sides, or not down to the table; --object NAME:X,Y on it makes it one."
         )
     names = ", ".join(item.name for item in found.objects)
     notes = (f"{len(found.objects)} {'object' if len(found.objects) == 1 else 'objects'}: {names}.",)
@@ -47,13 +47,13 @@ def model(job: Job) -> Outcome:
 
 def measure_left_over(found: SceneModels) -> float:
     """How much of the surface that rises above the support is near none of the objects; m²."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     scene, support = found.scene, found.support
     rises = (support.heights(scene.vertices) > _RISES) & support.covers(scene.vertices)
     points = np.concatenate([item.world_from_model @ item.mesh.vertices for item in found.objects])
     alone = rises.copy()
-    alone[rises] = cKDTree(points).query(scene.vertices[rises])[0] > _APART
+    alone[rises] = KDTree(points).query(scene.vertices[rises])[0] > _APART
     faces = scene.faces[alone[scene.faces].all(1)]
     return float(np.linalg.norm(corner_products(scene.vertices, faces), axis=-1).sum() / 2)
 
@@ -77,7 +77,7 @@ STEP = Step(
     does="Fuses the depth of all frames into one surface, takes the table away, and makes a model of each object.",
     picture="models.png",
     caption="Each object from four sides, in its colours and as a shape; red was not measured. Right if every object "
-    "of the table is there once, whole, and nothing of its neighbours is on it. If not: --click NAME:X,Y on "
+    "of the table is there once, whole, and nothing of its neighbours is on it. If not: --object NAME:X,Y on "
     "each of them.",
     needs=("pose", "refine", "depth"),
     results=("models",),

@@ -10,6 +10,10 @@ from ipjax.capture.records import Capture
 Progress = Callable[[str, int, int], None]  # part, done, total
 
 
+def tell_nobody(*_: object) -> None:
+    """Of progress that nobody watches."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """A number of a step, and what it means."""
@@ -51,7 +55,7 @@ class Job:
     work: Path  # the folder of what the steps make for one another
     dataset: Path  # the data set, which the last step makes
     settings: Any  # `ipjax.capture.steps.settings.RunSettings`
-    progress: Progress = lambda part, done, total: None
+    progress: Progress = tell_nobody
 
     def read_path(self, name: str) -> Path:
         """The file or folder of that name relative to the folder of work."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from ipjax.capture.records import CaptureError
-from ipjax.capture.steps.records import Job, Outcome, Progress, Step
+from ipjax.capture.steps.records import Job, Outcome, Progress, Step, tell_nobody
 from ipjax.capture.steps.workspace import (
     LOG,
     STEPS,
@@ -46,9 +46,9 @@ class Done:
 class Listener:
     """What a run tells while it runs."""
 
-    begins: Callable[[Step, str], None] = lambda step, why: None  # why it is made
-    ends: Callable[[Done], None] = lambda done: None
-    progress: Progress = lambda part, done, total: None
+    begins: Callable[[Step, str], None] = tell_nobody  # why it is made
+    ends: Callable[[Done], None] = tell_nobody
+    progress: Progress = tell_nobody
 
 
 def run_steps(

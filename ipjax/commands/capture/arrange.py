@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ipjax.commands.capture.bars import Bars
 from ipjax.commands.capture.model import add_again
 from ipjax.commands.capture.views import check_replaceable
 from ipjax.commands.interface import options
+from ipjax.commands.interface.bars import Bars
 from ipjax.commands.interface.messages import Messages
 from ipjax.commands.interface.parser import add_command, parse_count
 

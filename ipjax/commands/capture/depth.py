@@ -5,9 +5,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from ipjax.commands.capture.bars import Bars
 from ipjax.commands.capture.opening import add_capture, open_given
 from ipjax.commands.interface import options
+from ipjax.commands.interface.bars import Bars
 from ipjax.commands.interface.messages import Messages
 from ipjax.commands.interface.parser import add_command
 

@@ -7,21 +7,22 @@ import re
 from pathlib import Path
 from typing import Any
 
-from ipjax.commands.capture.bars import Bars
 from ipjax.commands.capture.opening import add_capture, open_given
 from ipjax.commands.interface import options
+from ipjax.commands.interface.bars import Bars
 from ipjax.commands.interface.messages import Messages
 from ipjax.commands.interface.parser import add_command
 
 EXAMPLES = """\
 examples:
   ipjax capture model table/ -o work/
-  ipjax capture model table/ -o work/ --click mug:312,204 --click box:420,233@000007
-  ipjax capture model table/ -o work/ --box mug:280,160,70,90 --voxel 1.5 --close
+  ipjax capture model table/ -o work/ --object mug:312,204 --object box:420,233@000007
+  ipjax capture model table/ -o work/ --object mug:280,160,70,90 --voxel 1.5 --close
 
 Objects are what stands on the table, apart from one another. Those that touch are told apart by the creases between
-them, or by a click (or a box) on each in one frame: NAME:X,Y, or NAME:X,Y@FRAME where it is not the first. Where
-something else than the table is taken for what they stand on, as the front of a large box may be, --support X,Y tells.
+them, or by a pixel or a box of each in one frame: --object NAME:X,Y or NAME:X,Y,W,H, with @FRAME where it is not the
+first. Where something else than the table is taken for what they stand on, as the front of a large box may be,
+--support X,Y tells.
 
 Reads WORK/refined.json or WORK/poses.json, and WORK/depth/, if the step depth made it. Writes WORK/models/: NAME.ply
 and NAME_points.ply of each object, scene.ply and scene_points.ply, models.json; and the picture WORK/models.png.
@@ -43,8 +44,9 @@ def add(steps: Any) -> None:
 
 def add_objects(parser: Any) -> None:
     """The options that say which objects there are, and how their models are made."""
-    parser.add_argument("--click", action="append", type=_parse_click, metavar="NAME:X,Y", help="an object, by a pixel")
-    parser.add_argument("--box", action="append", type=_parse_box, metavar="NAME:X,Y,W,H", help="an object, by a box")
+    parser.add_argument(
+        "--object", action="append", type=_parse_hint, metavar="NAME:X,Y[,W,H]", help="one, by a pixel or a box of it"
+    )
     parser.add_argument("--support", type=_parse_pixel, metavar="X,Y", help="a pixel of what they stand on")
     parser.add_argument("--voxel", type=float, default=2.0, metavar="MM", help="of the objects (default 2)")
     parser.add_argument("--close", action="store_true", help="close the bottoms, on which the objects stand")
@@ -66,7 +68,7 @@ def read_objects(arguments: argparse.Namespace) -> tuple[list[Any], Any]:
         close=arguments.close,
         colour_symmetries=not arguments.shape_symmetries,
     )
-    return [*(arguments.click or ()), *(arguments.box or ())], config
+    return arguments.object or [], config
 
 
 def add_again(parser: Any) -> None:
@@ -154,22 +156,17 @@ def describe_inputs(arguments: argparse.Namespace, work: Path, about: dict[str, 
     return hashlib.sha256(json.dumps(told).encode()).hexdigest()
 
 
-def _parse_click(text: str) -> Any:
-    return _parse_hint(text, 2, "NAME:X,Y, for instance mug:312,204 or mug:312,204@000007")
-
-
-def _parse_box(text: str) -> Any:
-    return _parse_hint(text, 4, "NAME:X,Y,W,H, for instance mug:280,160,70,90 or mug:280,160,70,90@000007")
-
-
 def _parse_pixel(text: str) -> Any:
     try:
-        return _parse_click(f"support:{text}")
+        hint = _parse_hint(f"support:{text}")
     except argparse.ArgumentTypeError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no pixel: give X,Y or X,Y@FRAME") from None
+        hint = None
+    if hint is None or hint.right is not None:
+        raise argparse.ArgumentTypeError(f"{text!r} is no pixel: give X,Y or X,Y@FRAME")
+    return hint
 
 
-def _parse_hint(text: str, count: int, form: str) -> Any:
+def _parse_hint(text: str) -> Any:
     from ipjax.capture.models.separation import Hint
 
     found = re.fullmatch(r"(?P<name>[^:@]+):(?P<numbers>[-\d.,]+)(@(?P<frame>.+))?", text)
@@ -177,8 +174,10 @@ def _parse_hint(text: str, count: int, form: str) -> Any:
         numbers = [float(part) for part in found["numbers"].split(",")] if found else []
     except ValueError:
         numbers = []
-    if found is None or len(numbers) != count:
-        raise argparse.ArgumentTypeError(f"{text!r} is no hint: give {form}")
+    if found is None or len(numbers) not in (2, 4):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no hint: give NAME:X,Y or NAME:X,Y,W,H, for instance mug:312,204 or mug:280,160,70,90@000007"
+        )
     x, y = numbers[:2]
-    box = {} if count == 2 else {"right": x + numbers[2], "bottom": y + numbers[3]}
+    box = {} if len(numbers) == 2 else {"right": x + numbers[2], "bottom": y + numbers[3]}
     return Hint(found["name"], found["frame"], x, y, **box)

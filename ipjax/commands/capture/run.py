@@ -4,12 +4,12 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ipjax.commands.capture.bars import Bars
 from ipjax.commands.capture.depth import MODES
 from ipjax.commands.capture.model import add_objects, read_objects
 from ipjax.commands.capture.opening import add_capture, open_given
 from ipjax.commands.capture.pose import METHODS
 from ipjax.commands.interface import options
+from ipjax.commands.interface.bars import Bars
 from ipjax.commands.interface.messages import Messages
 from ipjax.commands.interface.parser import add_command
 
@@ -17,13 +17,13 @@ STEPS = ("check", "pose", "refine", "depth", "model", "label")
 EXAMPLES = """\
 examples:
   ipjax capture run table/ -o mytable/
-  ipjax capture run table/ -o mytable/ --click mug:312,204 --click box:420,233@000007    what touches, told apart
+  ipjax capture run table/ -o mytable/ --object mug:312,204 --object box:420,233@000007    what touches, told apart
   ipjax capture run table/ -o mytable/ --from model         models and labels again, poses as they are
 
 Steps: check, pose, refine, depth, model, label. Writes the data set in BOP's layout, DATASET, and beside it the folder
 DATASET.work: what each step made, with a picture, and report.html, which shows all of them. Kill it at any moment and
 call it again: what is finished is not made again, unless the capture, settings or code it was made of changed. Single
-steps work in the same folder: ipjax capture model table/ -o mytable.work --click …, then run --from label.
+steps work in the same folder: ipjax capture model table/ -o mytable.work --object …, then run --from label.
 
 Frames without a pose, or whose pose is not sure, are left out, and named. Exits with 1 where the capture cannot be used
 as it is.

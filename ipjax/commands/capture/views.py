@@ -4,10 +4,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from ipjax.commands.capture.bars import Bars
 from ipjax.commands.capture.model import add_again, describe_inputs, find_poses, open_frames
 from ipjax.commands.capture.opening import add_capture
 from ipjax.commands.interface import options
+from ipjax.commands.interface.bars import Bars
 from ipjax.commands.interface.messages import Messages
 from ipjax.commands.interface.parser import add_command, parse_count
 

@@ -20,11 +20,11 @@ _TRIES = 2  # random offsets that a pixel tries in each iteration
 
 @partial(jax.jit, static_argnames="iterations")
 def propagate_offsets(
-    key: PRNGKeyArray,
     estimated: Float[Array, "h w"],
     estimated_normals: Float[Array, "h w 3"],
     captured: Float[Array, "h w"],
     captured_normals: Float[Array, "h w 3"],
+    key: PRNGKeyArray,
     *,
     reach: float | Float[Array, ""],
     unit: float | Float[Array, ""],

@@ -124,7 +124,7 @@ def test_steps_are_not_repeated_and_begin_anew_when_told(work, capsys):
 
 def test_what_is_wrong_is_said_in_a_sentence(work, tmp_path, capsys):
     words = [str(work / "table"), "-o", str(work / "work"), "--quiet"]
-    assert run(["capture", "model", *words, "--click", "mug"]) == 2
+    assert run(["capture", "model", *words, "--object", "mug"]) == 2
     assert "NAME:X,Y" in capsys.readouterr().err
     assert run(["capture", "model", str(work / "table"), "-o", str(tmp_path)]) == 2
     assert "ipjax capture pose" in capsys.readouterr().err
