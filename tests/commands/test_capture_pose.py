@@ -85,3 +85,14 @@ def test_refuses_in_one_line(folder, tmp_path, capfd, words, said):
     err = capfd.readouterr().err
     assert err.startswith("ipjax: ") and said in err and err.count("\n") == 1
     assert not (tmp_path / "work").exists()
+
+
+def test_a_depth_camera_without_a_place_is_told(made, folder, tmp_path, capfd):
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    shutil.rmtree(bare / "raw", ignore_errors=True)
+    (bare / "depth").rename(bare / "raw")
+    shutil.copy(bare / "camera.json", bare / "depth_camera.json")
+    poses = made.world_from_camera.to_matrix().tolist()
+    (bare / "poses.json").write_text(json.dumps(dict(zip(made.names, poses, strict=True))))
+    assert run(["capture", "pose", str(bare), "-o", str(tmp_path / "work"), "--quiet"]) == 0
+    assert "where the depth camera stands is not known" in capfd.readouterr().out.lower()

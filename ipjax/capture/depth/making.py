@@ -165,7 +165,7 @@ def make_depth(
         )
     work, tell = Path(work), progress or (lambda what, done, total: None)
     maker = DepthMaker(capture, trajectory)
-    key = _hash(capture, trajectory, mode, fused)
+    key = _hash(capture, trajectory, mode, fused, work)
     for folder in ("rgb", "depth", "confidence", "depth_pictures"):
         (work / folder).mkdir(parents=True, exist_ok=True)
     document = _read(work / "depth.json", key)
@@ -232,10 +232,13 @@ def _measure_filled(work: Path, names: tuple[str, ...]) -> float:
     return float(np.mean(shares))
 
 
-def _hash(capture: Capture, trajectory: Trajectory, mode: str, fused: bool) -> str:
-    """Of what the result depends on, but for the images themselves."""
+def _hash(capture: Capture, trajectory: Trajectory, mode: str, fused: bool, work: Path) -> str:
+    """Of what the result depends on; of the capture's files, how large and how new they are."""
     start, told = find_start(capture)
     settings = [VERSION, str(capture.folder.resolve()), capture.names, capture.size, mode, fused, told, start.to_json()]
+    own = work.resolve()  # may lie in the capture's folder
+    files = sorted(p for p in capture.folder.rglob("*") if p.is_file() and not p.resolve().is_relative_to(own))
+    settings.append([(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files])
     matrices = trajectory.world_from_camera.to_matrix().round(9).tolist()
     text = json.dumps([*settings, matrices, trajectory.registered.tolist()])
     return hashlib.sha256(text.encode()).hexdigest()[:16]

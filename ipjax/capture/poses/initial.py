@@ -63,15 +63,17 @@ def find_poses(
     if method == "board" and board is None:
         raise CaptureError("poses by a board need its description (--board)")
     K = capture.camera.to_matrix()
-    features = []
+    features, depths = [], []
     for index in range(len(capture)):
-        features.append(detect(_with_depth(capture, capture.read_frame(index))))
+        read = capture.read_frame(index)
+        depths.append(read.depth is not None)
+        features.append(detect(_with_depth(capture, read)))
         say("features", index + 1, len(capture))
     matches, still = match(
         features, K, capture.size, still=find_gripper, progress=lambda done, total: say("matches", done, total)
     )
     tracks = join(features, matches)
-    notes = _tell_gripper(still)
+    notes = [*_tell_gripper(still), *_tell_place(capture, depths)]
     if method == "given":
         trajectory = check_given(read_given(capture), tracks, K)
     elif method == "board":
@@ -149,6 +151,16 @@ def _with_depth(capture: Capture, frame: CaptureFrame) -> CaptureFrame:
     depth = np.full((height, width), np.inf)
     np.minimum.at(depth, (y[inside], x[inside]), points[inside, 2])  # the nearest hides the others
     return dataclasses.replace(frame, depth=np.where(np.isfinite(depth), depth, 0))
+
+
+def _tell_place(capture: Capture, registered: Sequence[bool]) -> list[str]:
+    """What was assumed of where the depth camera stands."""
+    if all(registered) or capture.depth_camera is None or capture.colour_from_depth is not None:
+        return []
+    return [
+        "where the depth camera stands is not known (colour_from_depth in depth_camera.json), and was taken for the "
+        "colour camera's own place: sizes may be some percent off; ipjax capture depth finds it"
+    ]
 
 
 def _tell_gripper(still: Bool[np.ndarray, "h w"]) -> list[str]:
