@@ -23,7 +23,7 @@ from ipjax.capture.labels.masks import find_box, label_frames
 from ipjax.capture.models.frames import PosedFrame, trust_depth
 from ipjax.capture.models.making import ModelConfig, SceneModels
 from ipjax.capture.models.separation import Hint
-from ipjax.files.storage.writing import write_text
+from ipjax.files.storage.writing import append_json, write_text
 from ipjax.synthetic.captures import MadeCapture, make_capture, register_depth
 from ipjax.transforms import Similarity
 
@@ -362,8 +362,7 @@ def main() -> None:
             found = measure_seed(
                 seed, options.views, tuple(options.size), exact=options.exact, with_open3d=options.open3d
             )
-            with open(options.output, "a", encoding="utf-8") as file:
-                file.write(json.dumps(found) + "\n")
+            append_json(options.output, found)
             print(f"seed {seed}: {found['cpu_seconds']}", file=sys.stderr, flush=True)
         return
     read = lambda paths: sorted(

@@ -118,18 +118,6 @@ def test_the_same_key_gives_the_same_answer(templates):
     jax.tree.map(np.testing.assert_array_equal, one, other)
 
 
-def test_vmap_over_queries_equals_the_loop(templates):
-    queries = [problems.make_query(seed)[0] for seed in (3, 4)]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *queries)
-    keys = jax.random.split(jax.random.key(1), 2)
-    together = jax.jit(jax.vmap(ipjax.estimate, (None, None, 0, 0, None)))(None, templates, stacked, keys, TINY)
-    for index, query in enumerate(queries):
-        alone = estimate(templates, query, keys[index], TINY)
-        one = jax.tree.map(lambda x, index=index: x[index], together)
-        assert int(one.view) == int(alone.view)
-        same(one.camera_from_object, alone.camera_from_object, 2e-3)
-
-
 def test_one_trace_for_all_thresholds_and_keys(templates):
     query, _ = problems.make_query(5)
     one = estimate(templates, query, jax.random.key(0), TINY)

@@ -103,8 +103,8 @@ def clean(tracks: Tracks, trajectory: Trajectory, K: Float[np.ndarray, "3 3"], w
 
 def write_tracks(path: str | Path, tracks: Tracks) -> Path:
     """Write tracks as an .npz file, whole or not at all; returns its path. Raises OSError."""
-    with writing(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, **{name: getattr(tracks, name) for name in _FIELDS})
+    with writing(path) as temporary:
+        np.savez(temporary, **{name: getattr(tracks, name) for name in _FIELDS})
     return Path(path)
 
 

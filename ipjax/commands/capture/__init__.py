@@ -5,7 +5,7 @@ from typing import Any
 from ipjax.commands.capture import arrange, check, depth, label, model, pose, refine, run, views
 from ipjax.commands.interface.parser import Parser, add_command
 
-STEPS = (run, check, pose, refine, depth, model, label, views, arrange)  # as --help lists them
+_STEPS = (run, check, pose, refine, depth, model, label, views, arrange)  # as --help lists them
 EXAMPLES = """\
 examples:
   ipjax capture run table/ -o mytable/         all of it: mytable/ in BOP's layout, mytable.work/report.html
@@ -29,5 +29,5 @@ def add(commands: Any) -> None:
         commands, "capture", None, "make a data set of a hand-held RGB-D capture, step by step", EXAMPLES
     )
     steps = parser.add_subparsers(title="steps", metavar="STEP", required=True, parser_class=Parser)
-    for step in STEPS:
+    for step in _STEPS:
         step.add(steps)

@@ -90,6 +90,10 @@ WRITERS = {"write_text", "write_bytes", "imwrite", "save", "savez", "savez_compr
 MAY = {  # by package, and why
     ("ipjax/files/storage", "write_bytes"): "the writer itself",
     ("ipjax/files/storage", "os.replace"): "the writer itself",
+    ("ipjax/files/storage", "os.rename"): "the writer of whole folders",
+    ("ipjax/capture/views", "np.save"): "the child's job, in a folder of its own",
+    ("ipjax/capture/views", "np.savez"): "the child's answer, in a folder of its own",
+    ("ipjax/capture/views", "write_text"): "the child's job, in a folder of its own",
     ("ipjax/files/storage", "open"): "a journal, a line at a time",
     (
         "ipjax/files/weights",
