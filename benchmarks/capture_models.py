@@ -42,7 +42,7 @@ def make_frames(seed: int, views: int, size: tuple[int, int], exact: bool) -> tu
     frames = []
     for index, name in enumerate(made.names):
         depth = register_depth(made.raw_depth[index], made.depth_camera, made.colour_from_depth, made.camera, size)
-        pose = Similarity(poses.rotation[index], poses.translation[index], np.ones(()))
+        pose = poses.take(index)
         usable = np.ones(depth.shape, bool)
         frames.append(PosedFrame(name, made.rgb[index], depth, usable, made.camera.to_matrix(), pose))
     return made, frames

@@ -21,7 +21,6 @@ from benchmarks.measure import commit, describe_device
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.views.drawing import ViewConfig, draw_views
 from ipjax.files.storage.writing import append_json, read_lines, write_text
-from ipjax.transforms import Similarity
 
 EVERY = 4  # of so many frames one is left out
 WAYS = {"views": ViewConfig(), "nearest frame alone": ViewConfig(near=1, far=0)}
@@ -35,7 +34,7 @@ def measure_seed(seed: int, views: int, size: tuple[int, int]) -> dict[str, Any]
     rest = [frame for index, frame in enumerate(frames) if index not in left]
     # The views stand where the frames were: at their true poses, which the frames around do not know.
     poses = made.world_from_camera
-    wanted = Similarity(poses.rotation[left], poses.translation[left], poses.scale[left])
+    wanted = poses.take(left)
     drawn, spent = {}, {}
     for name, config in WAYS.items():
         start = time.process_time()

@@ -16,6 +16,7 @@ origin is the object's centre, and whose unit is the object's diameter::
 So a turn of the object leaves its centre where it is, and a step in translation is in diameters.
 """
 
+from collections.abc import Sequence
 from typing import Any, Generic, overload
 
 import equinox as eqx
@@ -125,6 +126,28 @@ class Similarity(eqx.Module, Generic[A]):
         if isinstance(matrix, np.ndarray):
             _check_matrix(matrix, scale)
         return Similarity(linear / scale[..., None, None], matrix[..., :3, 3], scale)
+
+    def take(self, index: Any) -> "Similarity[A]":
+        """Those of many poses that ``index`` picks along the leading axis: a number, a slice, numbers, or a mask."""
+        return Similarity(*(_array(x[index]) for x in (self.rotation, self.translation, self.scale)))
+
+    @staticmethod
+    def stack(poses: Sequence["Similarity[A]"]) -> "Similarity[A]":
+        """Many poses as one, along a new leading axis.
+
+        Raises:
+          ValueError: there is none, or their batches differ.
+        """
+        if not poses:
+            raise ValueError("there is no pose to stack")
+        xp = _namespace(*(x for pose in poses for x in (pose.rotation, pose.translation, pose.scale)))
+        parts = zip(*((pose.rotation, pose.translation, pose.scale) for pose in poses), strict=True)
+        return Similarity(*(xp.stack([xp.asarray(x) for x in part]) for part in parts))
+
+    def orthonormal(self: "Similarity[np.ndarray]") -> "Similarity[np.ndarray]":
+        """The same with the nearest rotations, exact to the last digit: long products and short decimals drift."""
+        left, _, right = np.linalg.svd(self.rotation)
+        return Similarity(left @ right, self.translation, self.scale)
 
     def to_numpy(self) -> "Similarity[np.ndarray]":
         """The same in NumPy's doubles, for the host."""

@@ -293,3 +293,29 @@ def test_a_scale_may_be_a_plain_number():
     graph = Similarity(jnp.eye(3), jnp.zeros(3), 1)
     assert isinstance(graph.scale, jax.Array) and graph.scale.dtype == jnp.float32
     assert (graph @ jnp.ones((2, 3))).dtype == jnp.float32
+
+
+def test_poses_are_picked_and_stacked():
+    many = Similarity[np.ndarray].exp(np.random.default_rng(3).normal(0, 0.5, (4, 7)))
+    again = Similarity[np.ndarray].stack([many.take(index) for index in range(4)])
+    jax.tree.map(np.testing.assert_array_equal, again, many)
+    assert isinstance(many.take(2).scale, np.ndarray) and many.take(2).scale.shape == ()
+    mask = np.array([False, True, False, True])
+    jax.tree.map(np.testing.assert_array_equal, many.take(mask), many.take(np.array([1, 3])))
+    jax.tree.map(np.testing.assert_array_equal, many.take(slice(1, 2)).take(0), many.take(1))
+    jax.tree.map(
+        lambda x: np.testing.assert_array_equal(x[1], x[0]), jax.jit(Similarity.stack)([many.take(0).to_jax()] * 2)
+    )
+    with pytest.raises(ValueError, match="no pose"):
+        Similarity.stack([])
+
+
+def test_rotations_that_drifted_are_made_exact():
+    pose = Similarity[np.ndarray].exp(np.random.default_rng(4).normal(0, 0.5, (5, 7)))
+    drifted = Similarity(pose.rotation + 1e-6, pose.translation, pose.scale)
+    found = drifted.orthonormal()
+    np.testing.assert_allclose(
+        found.rotation @ np.swapaxes(found.rotation, -1, -2), np.tile(np.eye(3), (5, 1, 1)), atol=1e-15
+    )
+    np.testing.assert_allclose(found.rotation, pose.rotation, atol=2e-6)
+    assert found.translation is pose.translation and found.scale is pose.scale

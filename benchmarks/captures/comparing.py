@@ -18,7 +18,7 @@ def compare(
     """
     from scipy.optimize import least_squares
 
-    mine, true = (_take(poses, known) for poses in (found, truth))
+    mine, true = (poses.take(known) for poses in (found, truth))
     turn = np.linalg.svd(np.einsum("nij,nkj->ik", true.rotation, mine.rotation))
     turn = turn[0] @ turn[2]
     start = np.concatenate([vector_from_rotation(turn), true.translation.mean(0) - turn @ mine.translation.mean(0)])
@@ -43,12 +43,8 @@ def compare(
 
 def compare_scale(found: Similarity[np.ndarray], truth: Similarity[np.ndarray], known: Bool[np.ndarray, " n"]) -> float:
     """How much too large the trajectory is, as a share (the scale that fits its places to the true ones best)."""
-    mine, true = (_take(poses, known).translation for poses in (found, truth))
+    mine, true = (poses.take(known).translation for poses in (found, truth))
     mine, true = mine - mine.mean(0), true - true.mean(0)
     left, values, right = np.linalg.svd(true.T @ mine)
     values[-1] *= np.sign(np.linalg.det(left @ right))
     return float((mine**2).sum() / values.sum() - 1)
-
-
-def _take(poses: Similarity[np.ndarray], known: np.ndarray) -> Similarity[np.ndarray]:
-    return Similarity(poses.rotation[known], poses.translation[known], poses.scale[known])

@@ -89,7 +89,7 @@ def _try(capture: Any, truth: Any, found: Any, size: Any, way: str, seed: int) -
     frames = [capture.read_frame(index) for index in range(len(capture))]
     depths = [np.where(frame.usable & ~ignore, frame.depth, 0) for frame in frames]
     poses = refined.trajectory.world_from_camera
-    pick = lambda some, which: Similarity(some.rotation[which], some.translation[which], some.scale[which])
+    pick = lambda some, which: some.take(which)
     off = off_by(pick(poses, known), pick(truth, known))
     assert refined.trajectory.covariance is not None
     expected = np.sqrt(np.einsum("nii->ni", refined.trajectory.covariance[known]))

@@ -94,5 +94,4 @@ def to_rigid(matrices: np.ndarray) -> Similarity[np.ndarray]:
     if np.abs(pose.scale - 1).max(initial=0) > 1e-3:
         worst = float(pose.scale[np.abs(pose.scale - 1).argmax()])
         raise ValueError(f"a camera's pose keeps sizes, but one of these enlarges by {worst:.4g}")
-    left, _, right = np.linalg.svd(pose.rotation)  # proper, because from_matrix refuses mirrors
-    return Similarity(left @ right, pose.translation, np.ones(len(matrices)))
+    return Similarity(pose.rotation, pose.translation, np.ones(len(matrices))).orthonormal()

@@ -121,7 +121,7 @@ def make_capture(
 
     def draw(camera_from_rig: Similarity[np.ndarray], pinhole: Camera, pixels: tuple[int, int], done: int):
         camera_from_world = camera_from_rig @ world_from_camera.inverse()
-        shown = [(mesh, camera_from_world @ _repeat(pose, views)) for mesh, pose in world_from]
+        shown = [(mesh, camera_from_world @ pose) for mesh, pose in world_from]
         shown += [(mesh, camera_from_rig @ still) for mesh in fingers]
         lamp = {"direction": camera_from_world.rotation @ down, **light}
 
@@ -135,7 +135,7 @@ def make_capture(
         )
 
     seen = draw(still, camera, size, 0)
-    beside = draw(_repeat(colour_from_depth.inverse(), views), depth_camera, depth_size, views)
+    beside = draw(colour_from_depth.inverse(), depth_camera, depth_size, views)
     rgb = np.stack([expose(rng, image, sensor) for image in seen.rgb])
     raw = np.stack([sense_depth(rng, depth, depth_camera, sensor) for depth in beside.depth])
     raw[:, :, : round(_BAND * depth_size[0])] = 0
@@ -159,7 +159,7 @@ def make_capture(
         depth_camera=depth_camera,
         colour_from_depth=colour_from_depth,
         world_from_camera=world_from_camera,
-        world_from_object=_stack(placed),
+        world_from_object=Similarity[np.ndarray].stack(placed),
         meshes=tuple(objects),
         true_depth=seen.depth,
         ids=ids,
@@ -280,16 +280,6 @@ def _make_gripper(rng: np.random.Generator) -> list[Mesh]:
         texture = make_texture(int(rng.integers(2**31)), 128)
         fingers.append(make_mesh(vertices, faces, uv=np.tile(square, (6, 1)), texture=texture))
     return fingers
-
-
-def _repeat(pose: Similarity[np.ndarray], count: int) -> Similarity[np.ndarray]:
-    return Similarity(
-        *(np.repeat(np.asarray(x)[None], count, 0) for x in (pose.rotation, pose.translation, pose.scale))
-    )
-
-
-def _stack(poses: Sequence[Similarity[np.ndarray]]) -> Similarity[np.ndarray]:
-    return Similarity(*(np.stack([getattr(p, x) for p in poses]) for x in ("rotation", "translation", "scale")))
 
 
 def register_depth(

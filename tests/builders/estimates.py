@@ -17,9 +17,7 @@ def make_estimate(pose: Similarity, *, success: bool = True, present: bool = Tru
         scale_std=jnp.asarray(0.002),
         ambiguity=jnp.asarray([0.0, 0.0, turn]),
         agreement=Agreement(*(jnp.asarray(x) for x in (0.9, 0.8, 0.7, 0.5, 1.0, 0.6))),
-        hypotheses=Hypotheses(
-            Similarity(pose.rotation[None], pose.translation[None], pose.scale[None]), jnp.asarray([0.5])
-        ),
+        hypotheses=Hypotheses(pose.take(None), jnp.asarray([0.5])),
         view=jnp.asarray(1),
         view_score=jnp.zeros(5),
         inliers=jnp.asarray(12),

@@ -64,9 +64,9 @@ def surface_errors(
     nearest = _turn_to_nearest(hull, model.symmetries, truths, estimates)
     seen = _turn_to_nearest(model.points, model.symmetries, truths, estimates, cameras)
     for row, camera in enumerate(cameras):
-        truth, estimate = _at(nearest, row), _at(estimates, row)
+        truth, estimate = nearest.take(row), estimates.take(row)
         found.mssd[row] = metrics.surface_distance(hull, truth, estimate)
-        found.mspd[row] = metrics.projection_distance(model.points, camera, _at(seen, row), estimate)
+        found.mspd[row] = metrics.projection_distance(model.points, camera, seen.take(row), estimate)
         found.rotation[row] = metrics.rotation_error(truth.rotation, estimate.rotation)
         found.translation[row] = metrics.translation_error(truth.translation, estimate.translation)
     found.mssd[~metrics.spheres_overlap(model.diameter, truths, estimates)] = np.inf
@@ -77,7 +77,7 @@ def farthest_distances(model: Model, truths: Similarity[np.ndarray], estimates: 
     """MSSD [v] of pairs of poses, without BOP's pre-check; with the scale of the estimates a wrong size counts."""
     hull = _hull(model.points)
     nearest = _turn_to_nearest(hull, model.symmetries, truths, estimates)
-    pairs = ((_at(nearest, row), _at(estimates, row)) for row in range(len(truths.scale)))
+    pairs = ((nearest.take(row), estimates.take(row)) for row in range(len(truths.scale)))
     return np.array([metrics.surface_distance(hull, *pair) for pair in pairs], np.float64)
 
 
@@ -86,7 +86,7 @@ def least_turns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotation errors [v], radians, and translation errors [v], metres, of pairs of poses, to the symmetric pose whose
     rotation is nearest (`surface_errors` has those to the one that attains MSSD)."""
-    pairs = ((_at(truths, row), _at(estimates, row)) for row in range(len(truths.scale)))
+    pairs = ((truths.take(row), estimates.take(row)) for row in range(len(truths.scale)))
     found = np.array([metrics.symmetric_errors(model.symmetries, *pair) for pair in pairs], np.float64).reshape(-1, 2)
     return found[:, 0], found[:, 1]
 
@@ -110,7 +110,7 @@ def average_distances(
     query = None if tree is None else (lambda points: tree.query(points, workers=-1)[0])
     found = np.zeros(count)
     for row in range(count):
-        pair = _at(truths, row), _at(estimates, row)
+        pair = truths.take(row), estimates.take(row)
         found[row] = metrics.add_s(model.points, *pair, nearest=query) if nearest else metrics.add(model.points, *pair)
     return found
 
@@ -130,12 +130,12 @@ def _turn_to_nearest(
         constant = jnp.asarray(_padded(points), jnp.float32), _padded_symmetries(symmetries).to_jax()
         for start in range(0, count, BATCH):
             rows = np.minimum(np.arange(start, start + BATCH), count - 1)
-            pairs = [_at(poses, rows).to_jax() for poses in (truths, estimates)]
+            pairs = [poses.take(rows).to_jax() for poses in (truths, estimates)]
             camera = None if cameras is None else Camera.from_matrix(cameras[rows])
             found = _choose_symmetries(*constant, *pairs, camera, min(count - start, BATCH))
             chosen[start : start + BATCH] = np.asarray(found)[: count - start]
     # Padding repeats the first symmetry.
-    return truths @ _at(symmetries, np.where(chosen < len(symmetries.scale), chosen, 0))
+    return truths @ symmetries.take(np.where(chosen < len(symmetries.scale), chosen, 0))
 
 
 @jax.jit
@@ -150,10 +150,6 @@ def _choose_symmetries(points, symmetries, truths, estimates, cameras, count):
         return chosen.at[row].set(metrics.closest_symmetry(points, symmetries, truth, estimate, camera=camera)[1])
 
     return jax.lax.fori_loop(0, count, choose, jnp.zeros(len(truths.scale), jnp.int32))
-
-
-def _at(poses: Similarity[np.ndarray], rows: int | np.integer | np.ndarray) -> Similarity[np.ndarray]:
-    return jax.tree.map(lambda x: np.asarray(x[rows]), poses)
 
 
 def _hull(points: np.ndarray) -> np.ndarray:
@@ -178,4 +174,4 @@ def _padded_symmetries(symmetries: Similarity[np.ndarray]) -> Similarity[np.ndar
     """Likewise, the identity repeated."""
     count = len(symmetries.scale)
     extra = 8 - count if count <= 8 else -count % 64
-    return _at(symmetries, np.concatenate([np.arange(count), np.zeros(extra, int)]))
+    return symmetries.take(np.concatenate([np.arange(count), np.zeros(extra, int)]))

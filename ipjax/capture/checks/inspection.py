@@ -75,7 +75,7 @@ def inspect(capture: Capture, *, progress: Callable[[int, int], None] | None = N
         first = frame or capture.read_frame(int(looked_at[i]))
         frame = capture.read_frame(int(looked_at[i + 1]))
         found = _leave_out(raw[i, i + 1], hidden)
-        both = [(_at(pose, int(looked_at[i])), _at(pose, int(looked_at[i + 1]))) for pose in poses]
+        both = [(pose.take(int(looked_at[i])), pose.take(int(looked_at[i + 1]))) for pose in poses]
         pairs.append(measure_pair((first, frame), features, found, matrix, both))
     return Inspection(
         capture=capture,
@@ -110,7 +110,3 @@ def _read_poses(capture: Capture) -> tuple[tuple[str, ...], list[Similarity[np.n
 def _leave_out(found: Match, hidden: list[np.ndarray]) -> Match:
     """Without what moves with the camera."""
     return found.only(~(hidden[found.first][found.points[:, 0]] | hidden[found.second][found.points[:, 1]]))
-
-
-def _at(poses: Similarity[np.ndarray], index: int) -> Similarity[np.ndarray]:
-    return Similarity(poses.rotation[index], poses.translation[index], poses.scale[index])

@@ -42,7 +42,7 @@ class Views:
     def pose(self, place: int) -> Similarity[np.ndarray]:
         """world_from_camera of one of the views."""
         poses = self.world_from_camera
-        return Similarity(poses.rotation[place], poses.translation[place], np.ones(()))
+        return poses.take(place)
 
     def lift(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
         """A point for every pixel of one of these images, in its camera."""

@@ -108,9 +108,8 @@ def fuse_poses(
         if np.linalg.norm(step) < 1e-7 and np.linalg.norm(move) < 1e-9:
             break
     scale = np.exp(np.average(np.log(poses.scale[agreeing]), weights=np.maximum(weight[agreeing], 1e-9)))
-    left, _, right = np.linalg.svd(R)
     return FusedPose(
-        Similarity(left @ right, t, np.asarray(scale)),
+        Similarity(R, t, np.asarray(scale)).orthonormal(),
         agreeing,
         float(np.sqrt((angle[agreeing] ** 2).mean())),
         float(np.sqrt((distance[agreeing] ** 2).mean())),
@@ -150,9 +149,7 @@ def find_known(
                 found.append((frames[number].world_from_camera @ answer[0], answer[1]))
         if len(found) < 2:
             continue
-        poses = Similarity(
-            *(np.stack([getattr(p, part) for p, _ in found]) for part in ("rotation", "translation", "scale"))
-        )
+        poses = Similarity[np.ndarray].stack([pose for pose, _ in found])
         weight = np.array([confidence for _, confidence in found])
         fused = fuse_poses(poses, weight, float(np.median(poses.scale)), symmetries)
         total = float(weight[fused.agreeing].sum() / len(found))

@@ -91,7 +91,7 @@ def _label_batch(
     camera = Camera.from_matrix(first.camera)
     wide = Camera.from_matrix(crop(first.camera, (-rim[0], -rim[1])))
     together = render_frames(
-        [(model.mesh, _stack([row[k] for row in poses])) for k, model in enumerate(models)],
+        [(model.mesh, Similarity[np.ndarray].stack([row[k] for row in poses])) for k, model in enumerate(models)],
         camera,
         height,
         width,
@@ -101,7 +101,7 @@ def _label_batch(
     alone = render_each(
         [model.mesh for model in models],
         list(range(len(models))) * len(frames),
-        _stack([pose for row in poses for pose in row]).to_jax(),
+        Similarity[np.ndarray].stack([pose for row in poses for pose in row]).to_jax(),
         wide,
         height + 2 * rim[1],
         width + 2 * rim[0],
@@ -189,7 +189,3 @@ def _find_overhang(
             pixels = project(frame.camera, points)
             most = np.maximum(most, np.maximum(-0.5 - pixels.min(0), pixels.max(0) - size + 0.5))
     return np.ceil(most)
-
-
-def _stack(poses: Sequence[Similarity[np.ndarray]]) -> Similarity[np.ndarray]:
-    return Similarity(*(np.stack([getattr(p, part) for p in poses]) for part in ("rotation", "translation", "scale")))

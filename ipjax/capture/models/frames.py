@@ -98,7 +98,7 @@ class CaptureFrames(Sequence[PosedFrame]):
                 "make it with ipjax capture depth"
             )
         poses = self._trajectory.world_from_camera
-        pose = Similarity(poses.rotation[row], poses.translation[row], np.ones(()))
+        pose = poses.take(row)
         usable = frame.usable if self._ignore is None else frame.usable & ~self._ignore
         return PosedFrame(frame.name, frame.rgb, depth, usable, self._capture.camera.to_matrix(), pose, confidence)
 

@@ -129,7 +129,7 @@ def _begin_at_first(trajectory: Trajectory) -> Trajectory:
     """The same in the frame of the first camera that has a pose."""
     first = int(trajectory.registered.argmax())
     poses = trajectory.world_from_camera
-    moved = Similarity(poses.rotation[first], poses.translation[first], np.ones(())).inverse() @ poses
+    moved = poses.take(first).inverse() @ poses
     known = trajectory.registered
     rotation = np.where(known[:, None, None], moved.rotation, np.eye(3))
     translation = np.where(known[:, None], moved.translation, 0)

@@ -106,4 +106,4 @@ def read_depth_camera(path: Path) -> tuple[Intrinsics | None, Similarity[np.ndar
     if matrix is None:
         return camera, None
     pose = stack_matrices([matrix], [f"{path}: colour_from_depth"])
-    return camera, Similarity(pose.rotation[0], pose.translation[0], np.ones(()))
+    return camera, pose.take(0)

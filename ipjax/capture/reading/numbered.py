@@ -28,7 +28,6 @@ from ipjax.capture.reading.poses import read_matrix_file, stack_matrices
 from ipjax.capture.records import Capture, CaptureError
 from ipjax.files.cameras.intrinsics import Intrinsics
 from ipjax.files.storage.parsing import read_text
-from ipjax.transforms import Similarity
 
 _FILE = re.compile(r"(?P<name>.*?)\.(?P<kind>color|depth|pose)\.(?P<end>\w+)")
 _OWN_CAMERAS = ("camera-intrinsics.txt", "camera-intrinsics.color.txt")
@@ -117,7 +116,7 @@ def _read_info(path: Path) -> dict[str, Any]:
                 found["depth_camera" if "depth" in words else "camera"] = Intrinsics(matrix)
             elif "depth-to-color" in words:
                 pose = stack_matrices([matrix], [f"{path}: {headline}"])
-                found["colour_from_depth"] = Similarity(pose.rotation[0], pose.translation[0], np.ones(()))
+                found["colour_from_depth"] = pose.take(0)
             elif "camera-to-world" in words and " for " in words:
                 found["poses"][headline.rpartition(" for ")[2].strip()] = matrix
         except CaptureError:

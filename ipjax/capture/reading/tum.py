@@ -107,9 +107,7 @@ def open_tum(folder: Path, *, camera: Any, depth_scale: float | int | None, pose
     if twice is not None:
         raise CaptureError(f"{folder}: two of its images are called {twice}; frames are told apart by these names")
     if world_from_camera is not None:
-        world_from_camera = type(world_from_camera)(
-            world_from_camera.rotation[picked], world_from_camera.translation[picked], world_from_camera.scale[picked]
-        )
+        world_from_camera = world_from_camera.take(picked)
     return assemble(
         folder,
         "tum",

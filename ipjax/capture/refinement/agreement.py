@@ -35,10 +35,7 @@ def measure_agreement(
     height, width = depths[0].shape
     found = np.full(len(pairs), np.nan)
     for number, (first, second) in enumerate(pairs):
-        one, other = (
-            Similarity(world_from_camera.rotation[k], world_from_camera.translation[k], np.ones(()))
-            for k in (first, second)
-        )
+        one, other = (world_from_camera.take(k) for k in (first, second))
         moved = (other.inverse() @ one) @ lift(depths[first], K)
         moved = moved[moved[:, 2] > 0]
         x, y = np.round(project(K, moved)).astype(int).T
@@ -87,15 +84,7 @@ def draw_agreement(
     known = [k for k in np.flatnonzero(after.registered).tolist() if depths[k] is not None]
     upright = find_upright(after)
     clouds = {k: lift(np.asarray(depths[k]), K, _POINTS) for k in known}
-    place = lambda trajectory, k: (
-        (
-            Similarity(
-                trajectory.world_from_camera.rotation[k], trajectory.world_from_camera.translation[k], np.ones(())
-            )
-            @ clouds[k]
-        )
-        @ upright.T
-    )
+    place = lambda trajectory, k: (trajectory.world_from_camera.take(k) @ clouds[k]) @ upright.T
     everything = np.concatenate([place(after, k) for k in known])
     low, high = np.percentile(everything, [10, 90], axis=0)
     middle, reach = (low + high) / 2, 1.2 * float((high - low).max())

@@ -48,12 +48,7 @@ class PairSums:
 
 def relate(world_from_camera: Similarity[np.ndarray], pairs: Pairs) -> Similarity[np.ndarray]:
     """``target_from_source`` of every pair."""
-    return take(world_from_camera, pairs.target).inverse() @ take(world_from_camera, pairs.source)
-
-
-def take(poses: Similarity[np.ndarray], index: Int[np.ndarray, " k"]) -> Similarity[np.ndarray]:
-    """Some of many poses, along their leading axis."""
-    return Similarity(poses.rotation[index], poses.translation[index], poses.scale[index])
+    return world_from_camera.take(pairs.target).inverse() @ world_from_camera.take(pairs.source)
 
 
 def lever(target_from_source: Similarity[np.ndarray]) -> Float[np.ndarray, "*b 6 6"]:

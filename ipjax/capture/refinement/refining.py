@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from ipjax.capture.poses.tracks import collect, reproject, triangulate
 from ipjax.capture.records import Capture, CaptureError, Tracks, Trajectory
 from ipjax.capture.refinement.certainty import Certainty, judge
-from ipjax.capture.refinement.graph import Pairs, take
+from ipjax.capture.refinement.graph import Pairs
 from ipjax.capture.refinement.groups import all_pairs, choose_pairs, group_frames
 from ipjax.capture.refinement.solving import Equations, Problem, State, descend, evaluate
 from ipjax.capture.refinement.surfaces import Level, flatten_light, make_levels
@@ -131,7 +131,7 @@ def refine_frames(
     if len(known) < 2:
         raise CaptureError(f"{len(known)} of {len(trajectory)} frames have a pose: there is nothing to refine")
     levels, shrinkings = _make_levels(depths, brightness, camera)
-    poses = take(trajectory.world_from_camera.to_numpy(), known)
+    poses = trajectory.world_from_camera.to_numpy().take(known)
     problem = _make_problem(poses, _keep(tracks, trajectory.registered), camera, wanted)
     state = State(poses, Similarity(np.eye(3), np.zeros(3), np.ones(())), np.zeros((0, 3)))
     solver = _Solver(levels, shrinkings, problem, wanted, progress or (lambda part, done, total: None))
@@ -261,8 +261,8 @@ def _keep(tracks: Tracks | None, registered: Bool[np.ndarray, " n"]) -> Tracks |
 def _report(trajectory, known, state: State, equations, before, pairs, certainty: Certainty, problem) -> Refinement:
     count = len(trajectory)
     rotation, translation = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
-    left, _, right = np.linalg.svd(state.world_from_camera.rotation)  # exactly orthonormal again
-    rotation[known], translation[known] = left @ right, state.world_from_camera.translation
+    found = state.world_from_camera.orthonormal()
+    rotation[known], translation[known] = found.rotation, found.translation
     covariance = np.tile(np.diag([np.pi**2] * 3 + [1e6] * 3), (count, 1, 1))
     covariance[known] = certainty.covariance
     sure, remarks = np.zeros(count, bool), ["not registered"] * count

@@ -91,7 +91,7 @@ def arrange(
     down = np.array([0.0, 0, -1]) + 0.6 * rng.normal(size=3) * [1, 1, 0.3]
 
     camera_from_world = world_from_camera.inverse()
-    shown = [(thing.mesh, camera_from_world @ _repeat(thing.world_from_model, views)) for thing in things]
+    shown = [(thing.mesh, camera_from_world @ thing.world_from_model) for thing in things]
     shown += [(mesh, camera_from_world) for mesh in room]
     seen = render_frames(
         shown,
@@ -108,7 +108,7 @@ def arrange(
     camera = Camera.from_matrix(K)
     frames = []
     for number in range(views):
-        pose = Similarity(world_from_camera.rotation[number], world_from_camera.translation[number], np.ones(()))
+        pose = world_from_camera.take(number)
         rgb, depth = expose(rng, seen.rgb[number], sensor), sense_depth(rng, seen.depth[number], camera, sensor)
         frames.append(PosedFrame(f"{number:06d}", rgb, depth, np.ones(depth.shape, bool), K, pose))
     labels = label_frames(things, frames, exact=True, backend=backend)
@@ -131,8 +131,3 @@ def _draw_cameras(
         np.concatenate([rng.normal(0, [0.03, 0.03, 0.08], (views, 3)), np.zeros((views, 3))], 1)
     )
     return poses @ wobble
-
-
-def _repeat(pose: Similarity[np.ndarray], count: int) -> Similarity[np.ndarray]:
-    parts = (pose.rotation, pose.translation, pose.scale)
-    return Similarity(*(np.repeat(np.asarray(part)[None], count, 0) for part in parts))

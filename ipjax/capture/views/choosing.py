@@ -74,7 +74,7 @@ def choose_frames(
     near = np.linalg.norm(to_view, axis=-1)
     costs = []
     for index in range(len(captured.scale)):
-        frame = Similarity(captured.rotation[index], captured.translation[index], np.ones(()))
+        frame = captured.take(index)
         to_frame = frame.translation - points
         away = np.linalg.norm(to_frame, axis=-1)
         angle = np.arccos(np.clip((to_view * to_frame).sum(-1) / np.maximum(near * away, 1e-12), -1, 1))

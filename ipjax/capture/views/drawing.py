@@ -65,7 +65,7 @@ def draw_views(
     points = sample_scene(frames)
     if not len(points):
         raise ValueError("no frame has depth: there is nothing to draw")
-    captured = _stack([frame.world_from_camera for frame in frames])
+    captured = Similarity[np.ndarray].stack([frame.world_from_camera for frame in frames])
     gains = np.ones((len(frames), 3))
     if config.expose:
         middle = find_middle(frames)
@@ -78,7 +78,7 @@ def draw_views(
         numbers = [min(done + i, total - 1) for i in range(config.batch)]
         batch = []
         for number in numbers:
-            view = Similarity(views.rotation[number], views.translation[number], np.ones(()))
+            view = views.take(number)
             chosen, apart = choose_frames(view, K, size, captured, first.camera, first.size, points, count)
             weights = weigh(apart, config)
             batch.append(_collect([read(int(i)) for i in chosen], gains[chosen], weights, view))
@@ -90,7 +90,7 @@ def draw_views(
             size,
         )
         for place, number in enumerate(dict.fromkeys(numbers)):
-            pose = Similarity(views.rotation[number], views.translation[number], np.ones(()))
+            pose = views.take(number)
             found.append(_describe(f"{number:06d}", jax.tree.map(lambda x, i=place: np.asarray(x[i]), drawn), K, pose))
         done += config.batch
         if progress is not None:
@@ -138,7 +138,3 @@ def _collect(
 def _describe(name: str, drawn: Drawn, K: np.ndarray, pose: Similarity[np.ndarray]) -> PosedFrame:
     rgb = np.clip(np.round(drawn.colours), 0, 255).astype(np.uint8)
     return PosedFrame(name, rgb, np.asarray(drawn.depth), np.asarray(drawn.depth) > 0, K, pose)
-
-
-def _stack(poses: Sequence[Similarity[np.ndarray]]) -> Similarity[np.ndarray]:
-    return Similarity(*(np.stack([getattr(p, part) for p in poses]) for part in ("rotation", "translation", "scale")))

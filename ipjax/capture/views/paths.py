@@ -40,22 +40,22 @@ def smooth_path(captured: Similarity[np.ndarray], count: int) -> Similarity[np.n
     rows = np.clip(np.arange(known - 1)[:, None] + np.arange(-1, 3), 0, known - 1)
     fine = []
     for a, b, c, d in rows:
-        pose = _repeat(_take(captured, a), _FINE)
+        pose = captured.take(a)
         for step, (first, second) in enumerate(((a, b), (b, c), (c, d))):
-            motion = (_take(captured, first).inverse() @ _take(captured, second)).log()[:6]
+            motion = (captured.take(first).inverse() @ captured.take(second)).log()[:6]
             pose = pose @ Similarity[np.ndarray].exp(done[:, step, None] * motion)
         fine.append(pose)
-    fine.append(_repeat(_take(captured, known - 1), 1))
+    fine.append(captured.take(slice(known - 1, None)))
     path = _join(fine)
     lengths = np.linalg.norm(np.diff(path.translation, axis=0), axis=-1)
-    turned = _take(path, slice(None, -1)).inverse() @ _take(path, slice(1, None))
+    turned = path.take(slice(None, -1)).inverse() @ path.take(slice(1, None))
     lengths = lengths + _TURN * np.linalg.norm(turned.log()[:, :3], axis=-1)
     along = np.concatenate([[0], np.cumsum(lengths)])
     wanted = np.linspace(0, along[-1], count)
     place = np.clip(np.searchsorted(along, wanted, side="right") - 1, 0, len(lengths) - 1)
     rest = (wanted - along[place]) / np.maximum(lengths[place], 1e-12)
-    motion = _take(turned, place).log()[:, :6]
-    return _upright(_take(path, place) @ Similarity[np.ndarray].exp(np.clip(rest, 0, 1)[:, None] * motion))
+    motion = turned.take(place).log()[:, :6]
+    return (path.take(place) @ Similarity[np.ndarray].exp(np.clip(rest, 0, 1)[:, None] * motion)).orthonormal()
 
 
 def orbit_path(captured: Similarity[np.ndarray], middle: Float[np.ndarray, "3"], count: int) -> Similarity[np.ndarray]:
@@ -126,7 +126,7 @@ def read_path(path: str | Path) -> Similarity[np.ndarray]:
         document = read_json(path, "path of cameras")
         if isinstance(document, dict) and document.get("format") == FORMAT:
             trajectory = read_trajectory(path)
-            return _take(trajectory.world_from_camera, trajectory.registered)
+            return trajectory.world_from_camera.take(trajectory.registered)
         matrices = list(document.values()) if isinstance(document, dict) else document
         array = np.asarray(matrices, np.float64)
         if array.ndim != 3 or array.shape[1:] != (4, 4) or not len(array):
@@ -146,23 +146,7 @@ def _powers(share: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(share), share, share**2, share**3], -1)
 
 
-def _take(poses: Similarity[np.ndarray], index: object) -> Similarity[np.ndarray]:
-    parts = (poses.rotation, poses.translation, poses.scale)
-    return Similarity(*(np.asarray(part[index]) for part in parts))  # type: ignore[index]
-
-
-def _repeat(pose: Similarity[np.ndarray], count: int) -> Similarity[np.ndarray]:
-    parts = (pose.rotation, pose.translation, pose.scale)
-    return Similarity(*(np.repeat(np.asarray(part)[None], count, 0) for part in parts))
-
-
 def _join(poses: Sequence[Similarity[np.ndarray]]) -> Similarity[np.ndarray]:
     return Similarity(
         *(np.concatenate([getattr(p, part) for p in poses]) for part in ("rotation", "translation", "scale"))
     )
-
-
-def _upright(poses: Similarity[np.ndarray]) -> Similarity[np.ndarray]:
-    """The same with rotations that are orthonormal to the last digit: long products drift."""
-    left, _, right = np.linalg.svd(poses.rotation)
-    return Similarity(left @ right, poses.translation, np.ones(len(poses.scale)))

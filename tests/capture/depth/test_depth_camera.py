@@ -29,7 +29,7 @@ def gather(made, *, off=0.0, share=0.1) -> list[Evidence]:
         chosen = points[(depth.reshape(-1) < 1.5) & (rng.uniform(size=len(points)) < share)]
         chosen = chosen * (1 + rng.normal(0, 0.002, (len(chosen), 1)) + off * rng.uniform(-1, 1, (len(chosen), 1)))
         poses = made.world_from_camera
-        pose = Similarity(poses.rotation[index], poses.translation[index], np.ones(()))
+        pose = poses.take(index)
         evidence.append(Evidence(made.raw_depth[index].astype(float), pose, chosen, np.ones(len(chosen))))
     return evidence
 

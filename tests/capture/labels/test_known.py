@@ -11,7 +11,7 @@ from ipjax.transforms import Similarity, rotation_from_vector
 
 
 def stack(poses):
-    return Similarity(*(np.stack([getattr(p, part) for p in poses]) for part in ("rotation", "translation", "scale")))
+    return Similarity.stack(poses)
 
 
 def make_poses(rng, truth, symmetries, right=9, wrong=5):

@@ -48,7 +48,7 @@ def look(word: str, count: int = 3) -> Similarity[np.ndarray]:
 @pytest.mark.parametrize(("word", "within"), [*zip(WORDS, (0.0007, 0.004), strict=True)])
 def test_finds_the_camera(word, within):
     poses = look(word)
-    one = lambda i: Similarity(poses.rotation[i], poses.translation[i], poses.scale[i])
+    one = lambda i: poses.take(i)
     frames = [draw(word, one(i)) for i in range(3)]
     frames.append(CaptureFrame("d", np.full((480, 640, 3), 160, np.uint8), None, None, np.ones((480, 640), bool)))
     capture = Capture(Path("c"), "frames", tuple("abcd"), Camera.from_matrix(K), (640, 480), frames.__getitem__)

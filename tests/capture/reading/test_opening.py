@@ -104,7 +104,7 @@ def write_tum(made, folder, late=0.006, gap=False):
 
 
 def at(poses, index):
-    return Similarity(poses.rotation[index], poses.translation[index], poses.scale[index])
+    return poses.take(index)
 
 
 def test_tum_is_joined_by_time_and_poses_are_interpolated(made, tmp_path):

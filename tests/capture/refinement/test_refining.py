@@ -80,7 +80,7 @@ def test_points_tell_what_the_registration_of_depth_is_off_by(scene):
     cameras = truth @ off.inverse()  # the depth is seen from beside the colours
     frame, track, pixel = [], [], []
     for k in range(COUNT):
-        local = Similarity(cameras.rotation[k], cameras.translation[k], np.ones(())).inverse() @ points
+        local = cameras.take(k).inverse() @ points
         seen = local[:, :2] / local[:, 2:] * np.diag(K)[:2] + K[:2, 2]
         frame += [k] * len(points)
         track += list(range(len(points)))
