@@ -1,6 +1,5 @@
 """Depth in the pixels of the colours: how exact, on objects and their borders, how full, by which way, at what cost."""
 
-import dataclasses
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -139,7 +138,7 @@ def _measure_real(folder: Path, done: set[tuple]) -> Iterator[dict]:
     from ipjax.capture.depth.figures import measure_modes
     from ipjax.capture.depth.making import DepthMaker
     from ipjax.capture.depth.solving import spread
-    from ipjax.capture.moving import find_moving
+    from ipjax.capture.moving import find_moving, hide
     from ipjax.capture.reading.opening import open_capture
     from ipjax.capture.records import Trajectory
 
@@ -148,10 +147,7 @@ def _measure_real(folder: Path, done: set[tuple]) -> Iterator[dict]:
         if key in done or not (folder / name).is_dir():
             continue
         capture = open_capture(folder / name, camera="tum-fr3" if name == "cabinet" else None)
-        moving, read = find_moving(capture), capture.read_frame
-        capture = dataclasses.replace(
-            capture, read_frame=lambda index, read=read, moving=moving: _hide(read(index), moving)
-        )
+        capture = hide(capture, find_moving(capture))
         if capture.world_from_camera is None:
             continue
         poses = Trajectory(capture.names, capture.world_from_camera, np.ones(len(capture), bool), "given")
@@ -162,10 +158,6 @@ def _measure_real(folder: Path, done: set[tuple]) -> Iterator[dict]:
         figures = measure_modes(maker, solved.rig, spread(len(capture), 2))
         told = {way: each.tell() for way, each in figures.items()}
         yield {"key": key, "trusted": solved.trusted, "notes": list(solved.notes), "figures": told, "cpu": cpu}
-
-
-def _hide(frame: Any, moving: np.ndarray) -> Any:
-    return dataclasses.replace(frame, usable=frame.usable & ~moving)
 
 
 def tell(rows: list[dict]) -> list[str]:

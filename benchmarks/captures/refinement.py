@@ -64,7 +64,7 @@ def _find(capture: Any) -> Any:
 
 
 def _try(capture: Any, truth: Any, found: Any, size: Any, way: str, seed: int) -> dict:
-    from ipjax.capture.moving import find_moving
+    from ipjax.capture.moving import find_moving, hide
     from ipjax.capture.records import Trajectory
     from ipjax.capture.refinement.agreement import list_neighbours, measure_agreement
     from ipjax.capture.refinement.certainty import off_by
@@ -80,23 +80,23 @@ def _try(capture: Any, truth: Any, found: Any, size: Any, way: str, seed: int) -
         step = np.repeat([np.deg2rad(size[0]), size[1]], 3) * rng.normal(size=(len(capture), 6))
         start = Trajectory(capture.names, truth @ Similarity.exp(step), np.ones(len(capture), bool), "disturbed")
     begin = time.process_time()
-    ignore = find_moving(capture)
+    moving = find_moving(capture)
+    capture = hide(capture, moving)
     tracks = None if way == "without points" or found is None else found.tracks
     stages: Any = "global" if way == "without points" else way
-    refined = refine(capture, start, tracks, ignore=ignore, stages=stages)
+    refined = refine(capture, start, tracks, stages=stages)
     cpu = time.process_time() - begin
     known = start.registered
     frames = [capture.read_frame(index) for index in range(len(capture))]
-    depths = [np.where(frame.usable & ~ignore, frame.depth, 0) for frame in frames]
+    depths = [np.where(frame.usable, frame.depth, 0) for frame in frames]
     poses = refined.trajectory.world_from_camera
-    pick = lambda some, which: some.take(which)
-    off = off_by(pick(poses, known), pick(truth, known))
+    off = off_by(poses.take(known), truth.take(known))
     assert refined.trajectory.covariance is not None
     expected = np.sqrt(np.einsum("nii->ni", refined.trajectory.covariance[known]))
     row = {
         "frames": len(capture),
         "registered": int(known.sum()),
-        "moving": float(ignore.mean()),
+        "moving": float(moving.mean()),
         "bias": off.mean(0).tolist(),
         "over_expected": np.sqrt(np.mean((off / expected)[refined.sure[known]] ** 2, axis=0)).tolist()
         if refined.sure.any()

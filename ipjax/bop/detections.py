@@ -18,6 +18,7 @@ from jaxtyping import Bool
 
 from ipjax.bop.records import DatasetError, Target, TargetRow
 from ipjax.files.images.annotations import Annotation, decode_segmentation, read_annotations
+from ipjax.files.images.masks import box_of
 from ipjax.files.images.run_lengths import encode_rle
 from ipjax.files.storage.writing import write_text
 
@@ -71,15 +72,6 @@ def as_detection(
             raise ValueError(f"the mask of object {obj_id} in scene {scene_id}, image {im_id} is empty")
     x, y, width, height = map(float, box)
     return Detection(scene_id, im_id, obj_id, float(score), (x, y, width, height), float(time), encode_rle(mask))
-
-
-def box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int] | None:
-    """x, y, width, height of the smallest box around a mask, pixels; None where the mask is empty."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-    if not rows.size:
-        return None
-    left, top = int(columns[0]), int(rows[0])
-    return left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
 
 
 def read_detections(path: str | Path, *, problems: list[str] | None = None) -> list[Detection]:

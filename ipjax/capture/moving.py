@@ -4,12 +4,15 @@ Its depth and its colours are the same in nearly every frame, whatever the camer
 finds some of it by features alone; here every pixel is asked, so that plain surfaces are found, too.
 """
 
+import dataclasses
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from ipjax.capture.records import Capture
+from ipjax.capture.records import Capture, CaptureError, CaptureFrame, ReadFrame
+from ipjax.files.images.masks import read_mask
 
 NEAR = 0.015  # of the depth: what stays is this near to its median
 COLOUR = 14.0  # levels of 255: likewise, after exposure was taken off
@@ -30,6 +33,37 @@ def find_moving(capture: Capture, *, most: int = 40) -> Bool[np.ndarray, "h w"]:
     frames = [capture.read_frame(int(index)) for index in indices]
     depths = [frame.depth for frame in frames]
     return find_moving_in([frame.rgb for frame in frames], [depth for depth in depths if depth is not None])
+
+
+def read_ignored(work: Path, capture: Capture) -> Bool[np.ndarray, "h w"] | None:
+    """What moves with the camera, as the step pose left it in the folder of work; None = nothing does.
+
+    Raises:
+      CaptureError: it is of another size than the frames.
+    """
+    path = work / "ignore.png"
+    if not path.is_file():
+        return None
+    ignored = read_mask(path)
+    width, height = capture.size
+    if ignored.shape != (height, width):
+        raise CaptureError(f"{path}: it is of another size than the frames, {width} × {height}")
+    return ignored
+
+
+def hide(capture: Capture, ignored: Bool[np.ndarray, "h w"] | None) -> Capture:
+    """The capture, its frames without what is ignored in all of them."""
+    return capture if ignored is None else dataclasses.replace(capture, read_frame=_Hiding(capture.read_frame, ignored))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Hiding:
+    read: ReadFrame
+    ignored: Bool[np.ndarray, "h w"]
+
+    def __call__(self, index: int, /) -> CaptureFrame:
+        frame = self.read(index)
+        return dataclasses.replace(frame, usable=frame.usable & ~self.ignored)
 
 
 def find_moving_in(

@@ -16,6 +16,7 @@ from ipjax.detection.masks import mask_from_pose
 from ipjax.detection.records import Detection, Reason, Rejected, Rival, Step, Verdict
 from ipjax.detection.stopwatch import Stopwatch
 from ipjax.estimation.features import describe
+from ipjax.files.images.masks import box_of
 from ipjax.inference.estimator import Estimator, Result
 from ipjax.records import Patches, PoseEstimate
 
@@ -232,9 +233,8 @@ def describe_crop(estimator: Estimator, crop: Crop, watch: Stopwatch) -> Patches
 def as_detection(claim: Claim) -> Detection:
     """A claim that holds."""
     trial: Trial = claim.source
-    rows, columns = np.flatnonzero(claim.mask.any(1)), np.flatnonzero(claim.mask.any(0))
-    left, top = int(columns[0]), int(rows[0])
-    box = left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
+    box = box_of(claim.mask)
+    assert box is not None  # a claim without pixels was rejected
     about = trial.candidate.proposal, trial.candidate.similarity, overlap(trial.candidate.mask, claim.mask)
     steps = *trial.earlier, trial.as_step(claim.mask)
     return Detection(claim.index, claim.name, claim.mask, box, claim.value, trial.result, *about, steps)

@@ -16,8 +16,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ipjax.bop.dataset import VISIBLE, Dataset
-from ipjax.bop.detections import Detection, box_of, read_detections
+from ipjax.bop.detections import Detection, read_detections
 from ipjax.bop.records import DatasetError, Truth
+from ipjax.files.images.masks import box_of
 from ipjax.files.storage.writing import write_text
 from ipjax.metrics.precision import OVERLAPS, box_overlaps, mask_overlaps, overlap_precision
 

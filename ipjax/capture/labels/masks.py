@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull
 
-from ipjax.bop.detections import box_of
 from ipjax.cameras import crop, project, unproject
 from ipjax.capture.labels.borders import snap
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.models.making import ObjectModel
+from ipjax.files.images.masks import box_of
 from ipjax.records import Camera
 from ipjax.rendering.render import render_each, render_frames
 from ipjax.transforms import Similarity

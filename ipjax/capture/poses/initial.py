@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ipjax.cameras import project, unproject
+from ipjax.capture.moving import find_moving
 from ipjax.capture.poses import rgbd, structure
 from ipjax.capture.poses.boards import Board, find_by_board
 from ipjax.capture.poses.features import Features, Match, detect, match
@@ -73,6 +74,8 @@ def find_poses(
         features, K, capture.size, still=find_gripper, progress=lambda done, total: say("matches", done, total)
     )
     tracks = join(features, matches)
+    if find_gripper:
+        still = still | find_moving(capture)  # plain surfaces have no features
     notes = [*_tell_gripper(still), *_tell_place(capture, depths)]
     if method == "given":
         trajectory = check_given(read_given(capture), tracks, K)

@@ -72,7 +72,6 @@ def refine(
     trajectory: Trajectory,
     tracks: Tracks | None = None,
     *,
-    ignore: Bool[np.ndarray, "h w"] | None = None,
     stages: Stages = "global",
     settings: Settings | None = None,
     progress: Callable[[str, int, int], None] | None = None,
@@ -83,7 +82,6 @@ def refine(
       trajectory: the poses to begin with, right to about 2° per axis and 15 mm.
       tracks: points recognised in several frames. Without them the depth alone tells the poses: of the depth camera,
         rather than of the colours', if the factory's registration of the two is a little wrong.
-      ignore: what moves with the camera, in every frame, besides what frames say themselves.
       progress: told a part in words, and how much of it is done.
 
     Raises:
@@ -96,10 +94,9 @@ def refine(
         frame = capture.read_frame(int(index))
         if frame.depth is None:
             raise CaptureError(f"{capture.folder}: frame {frame.name} has no depth registered to its colours")
-        usable = frame.usable if ignore is None else frame.usable & ~ignore
-        depths.append(np.where(usable, frame.depth, 0).astype(np.float32))
+        depths.append(np.where(frame.usable, frame.depth, 0).astype(np.float32))
         if wanted.contrast:
-            colours.append(flatten_light(frame.rgb, usable))
+            colours.append(flatten_light(frame.rgb, frame.usable))
         say("reading", len(depths), int(trajectory.registered.sum()))
     return refine_frames(
         depths, colours or None, capture.camera, trajectory, tracks, stages=stages, settings=wanted, progress=progress

@@ -4,7 +4,7 @@ import numpy as np
 
 from ipjax.capture.depth.making import DepthReport, make_depth
 from ipjax.capture.labels.pictures import lay_out
-from ipjax.capture.steps.frames import hide, read_ignored
+from ipjax.capture.moving import hide, read_ignored
 from ipjax.capture.steps.records import Figure, Job, Outcome, Step, say
 from ipjax.capture.trajectories import read_trajectory
 from ipjax.files.images.opening import read_rgb
@@ -16,7 +16,7 @@ _FOLDERS = ("rgb", "depth", "confidence", "depth_pictures")
 
 def depth(job: Job) -> Outcome:
     """Depth and confidence of every frame, and the depth camera where that can be solved."""
-    capture = hide(job.capture, read_ignored(job))
+    capture = hide(job.capture, read_ignored(job.work, job.capture))
     trajectory = read_trajectory(job.work / "refined.json")
     mode = job.settings.depth_mode
     report = make_depth(capture, trajectory, job.work, mode=mode, progress=job.progress)

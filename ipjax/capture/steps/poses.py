@@ -1,14 +1,9 @@
 """The step pose: where did the camera stand?"""
 
-from ipjax.capture.moving import find_moving
-from ipjax.capture.pictures import draw_trajectory
 from ipjax.capture.poses.boards import parse_board
-from ipjax.capture.poses.initial import describe as describe_poses
 from ipjax.capture.poses.initial import find_poses
-from ipjax.capture.poses.tracks import write_tracks
+from ipjax.capture.poses.storing import write_poses
 from ipjax.capture.steps.records import Figure, Job, Outcome, Step, list_names, say
-from ipjax.capture.trajectories import write_trajectory
-from ipjax.inference.drawing import write_image
 
 _FEWEST = 3  # frames with a pose
 _AGREEING = 0.7  # share of the depth that agrees on the scale, below which poses are to be looked at
@@ -25,17 +20,9 @@ def pose(job: Job) -> Outcome:
         seed=settings.seed,
         progress=job.progress,
     )
-    trajectory = found.trajectory
-    lines = describe_poses(found)
-    moving = found.still | find_moving(capture) if settings.find_gripper else found.still
-    picture = draw_trajectory(trajectory, found.points, capture.camera.to_matrix(), capture.size, lines)
-    outputs = ["poses.json", "tracks.npz", "trajectory.png"]
-    write_tracks(job.work / "tracks.npz", found.tracks)
-    write_image(job.work / "trajectory.png", picture)
-    if moving.any():
-        write_image(job.work / "ignore.png", moving.astype("uint8") * 255)
-        outputs.append("ignore.png")
-    write_trajectory(job.work / "poses.json", trajectory)
+    trajectory, moving = found.trajectory, found.still
+    lines = write_poses(job.work, capture, found)
+    outputs = ["poses.json", "tracks.npz", "trajectory.png", *(["ignore.png"] if moving.any() else [])]
     count = int(trajectory.registered.sum())
     figures = [
         Figure("frames with a pose", f"{count} of {len(trajectory)}", "", "the others are left out from here on")

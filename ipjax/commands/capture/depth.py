@@ -42,9 +42,9 @@ def add(steps: Any) -> None:
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Make the depth of every frame; returns the exit status."""
     from ipjax.capture.depth.making import make_depth
+    from ipjax.capture.moving import hide, read_ignored
     from ipjax.capture.records import CaptureError
     from ipjax.capture.trajectories import read_trajectory
-    from ipjax.files.images.masks import read_mask
     from ipjax.inference.compilation_cache import use_compilation_cache
     from ipjax.inference.reports import to_json
 
@@ -55,13 +55,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         raise CaptureError(f"{candidates[-1]}: no such file; make it with ipjax capture pose, or give --poses")
     trajectory = read_trajectory(poses)
     capture = open_given(arguments, poses=False)
-    if work.resolve() == capture.folder.resolve():
-        raise CaptureError(f"{work}: the depth that is made would replace the capture's own; give another folder")
-    if (work / "ignore.png").is_file():
-        hidden = read_mask(work / "ignore.png")
-        if hidden.shape != capture.size[::-1]:
-            raise CaptureError(f"{work / 'ignore.png'}: it is of another size than the frames of {capture.folder}")
-        capture = _hide(capture, hidden)
+    capture = hide(capture, read_ignored(work, capture))
     use_compilation_cache()
     with Bars(quiet=arguments.quiet) as bars:
         report = make_depth(
@@ -85,14 +79,3 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         )
     )
     return 0 if solved.trusted or arguments.mode == "factory" else 1
-
-
-def _hide(capture: Any, hidden: Any) -> Any:
-    """The capture, with what `ipjax capture pose` and `refine` found to move along left out of every frame."""
-    read = capture.read_frame
-
-    def read_frame(index: int) -> Any:
-        frame = read(index)
-        return dataclasses.replace(frame, usable=frame.usable & ~hidden)
-
-    return dataclasses.replace(capture, read_frame=read_frame)

@@ -117,19 +117,16 @@ def open_frames(arguments: argparse.Namespace, work: Path, poses: Path | None = 
     poses of a file.
     """
     from ipjax.capture.models.frames import CaptureFrames
+    from ipjax.capture.moving import read_ignored
     from ipjax.capture.records import CaptureError
     from ipjax.capture.trajectories import read_trajectory
-    from ipjax.files.images.masks import read_mask
 
     capture = open_given(arguments, poses=False)
     found = poses or find_poses(work)
     if found is None:
         raise CaptureError(f"{work}: it has no poses.json; make it with ipjax capture pose")
-    improved, hidden = work if (work / "depth").is_dir() else None, work / "ignore.png"
-    ignore = read_mask(hidden) if hidden.is_file() else None
-    if ignore is not None and ignore.shape != capture.size[::-1]:
-        raise CaptureError(f"{hidden}: it is of another size than the frames, {capture.size[0]} × {capture.size[1]}")
-    frames = CaptureFrames(capture, read_trajectory(found), improved, ignore)
+    improved = work if (work / "depth").is_dir() else None
+    frames = CaptureFrames(capture, read_trajectory(found), improved, read_ignored(work, capture))
     # Every frame is looked at several times: short captures are kept in memory.
     pixels = len(frames) * capture.size[0] * capture.size[1]
     return list(frames) if pixels < _IN_MEMORY else frames

@@ -42,12 +42,9 @@ def add(steps: Any) -> None:
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Find the poses and write them; returns the exit status."""
-    from ipjax.capture.pictures import draw_trajectory
     from ipjax.capture.poses.boards import parse_board
-    from ipjax.capture.poses.initial import describe, find_poses
-    from ipjax.capture.poses.tracks import write_tracks
-    from ipjax.capture.trajectories import write_trajectory
-    from ipjax.inference.drawing import write_image
+    from ipjax.capture.poses.initial import find_poses
+    from ipjax.capture.poses.storing import write_poses
 
     work: Path = options.check_folder(arguments.output)
     board = None if arguments.board is None else parse_board(arguments.board)
@@ -61,17 +58,9 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
             seed=options.check_seed(arguments.seed),
             progress=bars.show,
         )
-    lines = describe(found)
-    picture = draw_trajectory(found.trajectory, found.points, capture.camera.to_matrix(), capture.size, lines)
-    work.mkdir(parents=True, exist_ok=True)
-    write_tracks(work / "tracks.npz", found.tracks)
-    write_image(work / "trajectory.png", picture)
-    (work / "ignore.png").unlink(missing_ok=True)  # of an earlier run; `refine` takes it for this one's
-    if found.still.any():
-        write_image(work / "ignore.png", found.still.astype("uint8") * 255)
     for name in ("refined.json", "refinement.json", "refinement.png"):  # they are of other poses, and would go before
         (work / name).unlink(missing_ok=True)
-    write_trajectory(work / "poses.json", found.trajectory)
+    lines = write_poses(work, capture, found)
     for line in lines:
         messages.say(f"{line[0].upper()}{line[1:]}.")
     trajectory = found.trajectory

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from PIL import Image
 
 from ipjax.files.images.arrays import as_native, load_npy
@@ -184,3 +185,12 @@ def _check_two_values(values: np.ndarray, full: float, dark: np.ndarray, bright:
 def _list_labels(values: np.ndarray) -> str:
     kinds = np.unique(values).astype(np.float64)
     return f" ({', '.join(f'{kind:g}' for kind in kinds[:8])}{' …' if len(kinds) > 8 else ''})"
+
+
+def box_of(mask: Bool[np.ndarray, "h w"]) -> tuple[int, int, int, int] | None:
+    """x, y, width, height of the smallest box around a mask, pixels; None where the mask is empty."""
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    if not rows.size:
+        return None
+    left, top = int(columns[0]), int(rows[0])
+    return left, top, int(columns[-1]) - left + 1, int(rows[-1]) - top + 1
