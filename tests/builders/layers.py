@@ -31,6 +31,7 @@ ORDER = [
     ["ipjax.synthetic"],
     ["ipjax.bop"],
     ["ipjax.capture"],
+    ["ipjax.robot"],
     ["ipjax.commands"],
     ["ipjax.cli"],
     ["ipjax.__main__"],
