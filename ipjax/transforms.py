@@ -202,6 +202,22 @@ def rotation_from_vector(vector: Float[A, "*b 3"]) -> Float[A, "*b 3 3"]:
     return xp.eye(3, dtype=vector.dtype) * (1 - cosine * squared) + sine * cross + cosine * outer
 
 
+def rotation_from_quaternion(quaternion: Float[A, "*b 4"]) -> Float[A, "*b 3 3"]:
+    """The rotation of a quaternion x, y, z, w of any length; of four zeros the one that turns nothing."""
+    xp = _namespace(quaternion)
+    largest = xp.max(xp.abs(quaternion), axis=-1, keepdims=True)
+    quaternion = quaternion / xp.where(largest > 0, largest, xp.ones_like(largest))  # no square overflows
+    squared = xp.sum(quaternion * quaternion, axis=-1)
+    twice = 2 / xp.where(squared > 0, squared, xp.ones_like(squared))
+    x, y, z, w = (quaternion[..., i] for i in range(4))
+    rows = [
+        [1 - twice * (y * y + z * z), twice * (x * y - w * z), twice * (x * z + w * y)],
+        [twice * (x * y + w * z), 1 - twice * (x * x + z * z), twice * (y * z - w * x)],
+        [twice * (x * z - w * y), twice * (y * z + w * x), 1 - twice * (x * x + y * y)],
+    ]
+    return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def vector_from_rotation(rotation: Float[A, "*b 3 3"]) -> Float[A, "*b 3"]:
     """The rotation vector, of length 0 to π; it and its derivative are finite at zero. At π either sign may come.
 

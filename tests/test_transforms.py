@@ -10,7 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ipjax.transforms import Similarity, difference, retract, rotation_from_vector, vector_from_rotation
+from ipjax.transforms import (
+    Similarity,
+    difference,
+    retract,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    vector_from_rotation,
+)
 
 KINDS = ["numpy float64", "numpy float32", "jax float32", "jax float64"]
 TOLERANCE = {"float32": 1e-5, "float64": 2e-14}
@@ -319,3 +326,17 @@ def test_rotations_that_drifted_are_made_exact():
     )
     np.testing.assert_allclose(found.rotation, pose.rotation, atol=2e-6)
     assert found.translation is pose.translation and found.scale is pose.scale
+
+
+def test_quaternions_turn_as_their_vectors_do():
+    """x, y, z, w = (axis · sin, cos) of half the angle, of any length and either sign; four zeros turn nothing."""
+    rng = np.random.default_rng(3)
+    vector = rng.normal(size=(20, 3))
+    half = np.linalg.norm(vector, axis=1, keepdims=True) / 2
+    quaternion = np.concatenate([vector / (2 * half) * np.sin(half), np.cos(half)], 1)
+    for factor in (1.0, -1.0, 1e200, 1e-200):
+        found = rotation_from_quaternion(factor * quaternion)
+        np.testing.assert_allclose(found, rotation_from_vector(vector), atol=1e-13)
+    single = rotation_from_quaternion(jnp.asarray(quaternion, jnp.float32))
+    np.testing.assert_allclose(single, rotation_from_vector(vector), atol=1e-6)
+    np.testing.assert_array_equal(rotation_from_quaternion(np.zeros(4)), np.eye(3))

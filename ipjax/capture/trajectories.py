@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from ipjax.capture.records import CaptureError, Trajectory
+from ipjax.files.rigid import to_rigid
 from ipjax.files.storage.parsing import read_json
 from ipjax.files.storage.writing import write_text
-from ipjax.transforms import Similarity
 
 FORMAT, VERSION = "ipjax trajectory", 1
 
@@ -82,16 +82,3 @@ def _parse(document: dict[str, Any]) -> Trajectory:
         covariance = np.asarray(covariance, np.float64).reshape(len(names), 6, 6)
     numbers = {name: None if document.get(name) is None else float(document[name]) for name in ("scale", "agreement")}
     return Trajectory(names, to_rigid(matrices), registered, str(document["source"]), covariance, **numbers)
-
-
-def to_rigid(matrices: np.ndarray) -> Similarity[np.ndarray]:
-    """Poses ``n 4 4`` as rigid motions in doubles, their rotations made exactly orthonormal.
-
-    Raises:
-      ValueError: they are not finite, or stretch, shear or mirror, by a thousandth or more.
-    """
-    pose = Similarity[np.ndarray].from_matrix(np.asarray(matrices, np.float64))
-    if np.abs(pose.scale - 1).max(initial=0) > 1e-3:
-        worst = float(pose.scale[np.abs(pose.scale - 1).argmax()])
-        raise ValueError(f"a camera's pose keeps sizes, but one of these enlarges by {worst:.4g}")
-    return Similarity(pose.rotation, pose.translation, np.ones(len(matrices))).orthonormal()

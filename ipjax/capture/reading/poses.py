@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ipjax.capture.records import CaptureError
-from ipjax.capture.trajectories import FORMAT, read_trajectory, to_rigid
+from ipjax.capture.trajectories import FORMAT, read_trajectory
+from ipjax.files.rigid import to_rigid
 from ipjax.files.storage.parsing import read_json, read_text
-from ipjax.transforms import Similarity, rotation_from_vector, vector_from_rotation
+from ipjax.transforms import Similarity, rotation_from_quaternion, rotation_from_vector, vector_from_rotation
 
 NEAR = 0.02  # seconds between two times that are of one moment
 
@@ -99,15 +100,7 @@ def read_timed_poses(path: Path) -> tuple[np.ndarray, Similarity[np.ndarray]]:
     if not rows:
         raise CaptureError(f"{path}: there are no poses in it")
     table = np.array(rows)
-    x, y, z, w = (table[:, 4:] / np.linalg.norm(table[:, 4:], axis=1, keepdims=True)).T
-    rotation = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
-            np.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
-            np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
-        ],
-        axis=1,
-    )
+    rotation = rotation_from_quaternion(table[:, 4:])
     return table[:, 0], Similarity(rotation, table[:, 1:4], np.ones(len(table)))
 
 

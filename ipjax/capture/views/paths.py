@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ipjax.capture.records import CaptureError
-from ipjax.capture.trajectories import FORMAT, read_trajectory, to_rigid
+from ipjax.capture.trajectories import FORMAT, read_trajectory
+from ipjax.files.rigid import to_rigid
 from ipjax.files.storage.parsing import read_json
 from ipjax.transforms import Similarity
 

@@ -15,6 +15,7 @@ from ipjax.files.meshes.formats.gltf_materials import Material, Materials
 from ipjax.files.meshes.formats.part import Part, drop_unused
 from ipjax.files.meshes.formats.source import MAX_FACES, Source
 from ipjax.files.meshes.textures import from_linear, to_linear
+from ipjax.transforms import rotation_from_quaternion
 
 # Extensions that are read, and those that change neither the shape nor the base colour.
 HANDLED = {
@@ -283,15 +284,7 @@ class _Scene:
 
 def compose_matrix(translation: np.ndarray, rotation: np.ndarray, scale: np.ndarray) -> np.ndarray:
     """T R S as a matrix [4 4]; the rotation is a quaternion x, y, z, w."""
-    length = np.linalg.norm(rotation)
-    x, y, z, w = rotation / length if length > 0 else np.array([0.0, 0, 0, 1])
-    turned = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turned = rotation_from_quaternion(np.asarray(rotation, np.float64))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turned * scale, translation
     return matrix
