@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         Config,
         DescribeConfig,
         DetectConfig,
+        GraspConfig,
         MatchConfig,
         OnboardConfig,
         RefineConfig,
@@ -49,6 +50,9 @@ if TYPE_CHECKING:
     from ipjax.onboarding.photo import onboard_photo
     from ipjax.onboarding.photographed import onboard_with_photo
     from ipjax.records import Camera, Patches, PoseEstimate, Query, ReferenceView, Surface, Templates, View
+    from ipjax.robot.grasps.planning import box_grasps, plan_grasps
+    from ipjax.robot.grippers import read_gripper, write_gripper
+    from ipjax.robot.records import Grasps, Gripper, Workspace, place_grasps
     from ipjax.synthetic.degradation import degrade
     from ipjax.synthetic.objects import make_object
     from ipjax.synthetic.scenes import make_scene
@@ -67,6 +71,9 @@ __all__ = [
     "Detections",
     "Detector",
     "Estimator",
+    "GraspConfig",
+    "Grasps",
+    "Gripper",
     "Intrinsics",
     "MatchConfig",
     "Mesh",
@@ -84,6 +91,8 @@ __all__ = [
     "Surface",
     "Templates",
     "View",
+    "Workspace",
+    "box_grasps",
     "compact",
     "degrade",
     "describe",
@@ -103,15 +112,19 @@ __all__ = [
     "onboard_photo",
     "onboard_with_photo",
     "pad_templates",
+    "place_grasps",
+    "plan_grasps",
     "read_camera",
     "read_candidates",
     "read_depth",
+    "read_gripper",
     "read_mask",
     "read_results",
     "read_rgb",
     "save",
     "save_mesh",
     "score",
+    "write_gripper",
     "write_results",
 ]
 
@@ -130,6 +143,7 @@ _HOMES = {
         "Config",
         "DescribeConfig",
         "DetectConfig",
+        "GraspConfig",
         "MatchConfig",
         "OnboardConfig",
         "RefineConfig",
@@ -183,6 +197,20 @@ _HOMES = {
         "Surface",
         "Templates",
         "View",
+    ),
+    "robot.grasps.planning": (
+        "box_grasps",
+        "plan_grasps",
+    ),
+    "robot.grippers": (
+        "read_gripper",
+        "write_gripper",
+    ),
+    "robot.records": (
+        "Grasps",
+        "Gripper",
+        "Workspace",
+        "place_grasps",
     ),
     "synthetic.degradation": ("degrade",),
     "synthetic.objects": ("make_object",),

@@ -214,6 +214,39 @@ class DetectConfig(eqx.Module):
         return dataclasses.replace(config, confidence=dataclasses.replace(config.confidence, drawn=self.drawn))
 
 
+class GraspConfig(eqx.Module):
+    """From a pose and a surface to grasps (`ipjax.plan_grasps`)."""
+
+    grasps: int = _static(32, least=1)  # that are handed out, best first
+    anchors: int = _static(512, least=1)  # surface points at which a partner on the other side is sought
+    pairs: int = _static(128, least=1)  # of those found that are kept
+    approaches: int = _static(12, least=1)  # directions about the closing axis from which each is tried
+    tried: int = _static(768, least=1)  # hands that are closed on the object
+    distinct: int = _static(64, least=1)  # best of them, unlike each other, that are tried at other poses, too
+    poses: int = _static(16)  # within the estimate's uncertainty; 0 = the estimate alone
+    cone: float = 0.45  # rad (26°): largest angle between a surface and a pad that does not slip: friction 0.48
+    facing: float = 0.7  # least cosine between a pad and surface that supports it
+    depth: float = 0.003  # m: by which a pad gives way; surface farther behind does not support it
+    support: float = 0.5  # share of a pad that is surface which faces it, above which more is no better
+    least_support: float = 0.2  # below which it is no grasp: the lip of a can
+    least_spare: float = 0.002  # m, each finger: below which it is no grasp
+    # m, each finger: below which a grasp is penalised where the estimate is certain: what hand-eye calibration and the
+    # arm are off. Of simulated picks with less, 4 of 11 failed.
+    spare: float = 0.016
+    spare_deviations: float = 3.0  # of the estimate along the closing axis, by which more is wanted
+    tight: float = 0.2  # a score is multiplied by this where nothing is to spare
+    unseen: float = 0.3  # and by 1 − this where the pads touch surface that was guessed
+    unknown: float = 0.5  # and by 1 − this where all of the hand is out of sight behind something else
+    aslant: float = 0.3  # and by 1 − this at an approach against the wanted one
+    arm: float = 0.12  # m from the centre of the surface, sideways, at which it is multiplied by exp(−½)
+    tilt: float = 3.2  # rad: largest angle between the approach and straight down; above π there is no limit
+    clearance: float = 0.003  # m between the hand and the table
+    retreat: float = 0.1  # m: the straight way of the hand to the object, which is free
+    margin: float = 0.01  # m by which the hand may lie behind measured depth: noise
+    behind: float = 0.06  # m behind measured depth up to which the hand collides: things are about as thick
+    apart: tuple[float, float] = (0.01, 0.26)  # m and rad: grasps closer than both are one
+
+
 PRESETS = ("default", "fast", "paper")
 
 

@@ -43,7 +43,7 @@ class Gripper(eqx.Module):
         return self.reach + self.pad[0] / 2
 
 
-class Scene(eqx.Module):
+class Workspace(eqx.Module):
     """What is around the object, in the camera's frame; what is None is not known and hinders nothing.
 
     The hand stays above the table. Where the hand lies behind a measured surface that is not the object's own, by less
@@ -112,7 +112,7 @@ def place_grasps(
 
 
 def table_in_camera(height: Number, base_from_camera: Similarity) -> Float[Array, "4"]:
-    """The table ``z = height`` of the robot's base frame (m, z up), as :class:`Scene` has it in the camera's frame."""
+    """The table ``z = height`` of the robot's base frame (m, z up), as :class:`Workspace` has it."""
     normal = base_from_camera.rotation[2]
     offset = height - base_from_camera.translation[2]
     return jnp.concatenate([jnp.asarray(normal), jnp.asarray(offset, normal.dtype)[None]])
