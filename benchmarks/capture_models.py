@@ -24,7 +24,8 @@ from ipjax.capture.models.frames import PosedFrame, trust_depth
 from ipjax.capture.models.making import ModelConfig, SceneModels
 from ipjax.capture.models.separation import Hint
 from ipjax.files.storage.writing import append_json, write_text
-from ipjax.synthetic.captures import MadeCapture, make_capture, register_depth
+from ipjax.inference.depth import register_depth
+from ipjax.synthetic.captures import MadeCapture, make_capture
 from ipjax.transforms import Similarity
 
 TURN, SHIFT = 0.05, 0.001  # degrees and metres, rms

@@ -93,11 +93,7 @@ def mend_mask(
 
 def rate_pose(result: Result, given: Bool[np.ndarray, "h w"], scene: Scene, config: DetectConfig) -> float:
     """What poses for one rough mask are compared by, where no size is known."""
-    found = result.estimate
-    if not bool(found.success):
-        return 0.0
-    value = float(found.confidence) * float(found.hypotheses.score[0])
-    return value * _cover(_pose_mask(result, given, scene, config), given)
+    return result.value and result.value * _cover(_pose_mask(result, given, scene, config), given)
 
 
 def _pose_mask(result: Result, given: np.ndarray, scene: Scene, config: DetectConfig) -> np.ndarray:

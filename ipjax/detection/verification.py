@@ -18,7 +18,7 @@ from ipjax.detection.stopwatch import Stopwatch
 from ipjax.estimation.features import describe
 from ipjax.files.images.masks import box_of
 from ipjax.inference.estimator import Estimator, Result
-from ipjax.records import Patches, PoseEstimate
+from ipjax.records import Patches
 
 ELSEWHERE = Verdict(Reason.OTHER_DEPTH, "the depth where its pose is belongs to something else")
 OFF_CLICK = Verdict(Reason.OFF_CLICK, "its pose is not at the click")
@@ -118,17 +118,14 @@ class Verifier:
         with self.watch(stage):
             result = self.estimator.run(candidate.index, *about, seed=self.seed, patches=patches, drawn=drawn)
         self.watch.move("compile", result.seconds.get("compile", 0.0), stage)
-        return Trial(candidate, result, self._value(result.estimate), where, earlier)
+        return Trial(candidate, result, self._value(result), where, earlier)
 
-    def _value(self, found: PoseEstimate) -> float:
+    def _value(self, result: Result) -> float:
         """What trials are compared by: confidence × score, and how well a known size agrees."""
-        if not bool(found.success):
-            return 0.0
-        value = float(found.confidence) * float(found.hypotheses.score[0])
-        if self.diameter is None:
-            return value
-        off = np.log(float(found.diameter) / self.diameter) / self.settings.size_deviation
-        return value * float(np.exp(-0.5 * off**2))
+        if self.diameter is None or not result.value:
+            return result.value
+        off = np.log(float(result.estimate.diameter) / self.diameter) / self.settings.size_deviation
+        return result.value * float(np.exp(-0.5 * off**2))
 
     def _mend(self, trials: Sequence[Trial], chosen: list[Trial], most: int) -> list[Trial]:
         """The best poses that differ, estimated again in the masks that they give; ``chosen`` has them, too."""

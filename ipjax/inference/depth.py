@@ -4,7 +4,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from ipjax.cameras import project, unproject
 from ipjax.files.cameras.intrinsics import Intrinsics, check_depth_scale
+from ipjax.records import Camera
+from ipjax.transforms import Similarity
 
 _NEAREST, _FARTHEST = 0.01, 30.0  # metres; a median depth outside is taken for a wrong unit
 _HARDLY = 0.01  # share of a whole frame's depth between both, below which its unit is wrong: walls may be farther
@@ -153,3 +156,36 @@ def _unit_in_words(median: float, else_say: str, scale: float | None) -> str:
             asked = f" with depth_scale={scale:g}" if scale not in (None, 1.0) else ""
             return f"median depth {median:.4g}{asked}: this looks like {name}; pass depth_scale={unit:g}"
     return f"median depth {median:.4g}: {else_say}; pass depth_scale, the metres per depth unit"
+
+
+def register_depth(
+    depth: np.ndarray,
+    depth_camera: Camera,
+    colour_from_depth: Similarity[np.ndarray],
+    camera: Camera,
+    size: tuple[int, int],
+) -> np.ndarray:
+    """Raw depth in the colour camera's pixels, as the makers of RGB-D cameras do it: every pixel of the depth camera
+    covers what of the colour image it projects to, and the nearest wins.
+    """
+    width, height = size
+    rows, columns = np.nonzero(depth > 0)
+    points = unproject(
+        depth_camera.to_matrix(), np.stack([columns, rows], -1).astype(np.float64), depth[rows, columns].astype(float)
+    )
+    moved = colour_from_depth @ points
+    moved = moved[moved[:, 2] > 0.05]
+    x, y = project(camera.to_matrix(), moved).T
+    # Half of what a pixel covers, with a little more so that no seams are left.
+    zoom = np.asarray(camera.focal, float) / np.asarray(depth_camera.focal, float)
+    half = 0.55 * zoom * np.ones((len(moved), 2))
+    nearest = np.full((height, width), np.inf)
+    first_x, first_y = np.ceil(x - half[:, 0]).astype(int), np.ceil(y - half[:, 1]).astype(int)
+    reach_x, reach_y = (int(np.ceil(2 * side)) + 1 for side in half.max(0))
+    for dy in range(reach_y):
+        for dx in range(reach_x):
+            column, row = first_x + dx, first_y + dy
+            inside = (column <= x + half[:, 0]) & (row <= y + half[:, 1])
+            inside &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            np.minimum.at(nearest, (row[inside], column[inside]), moved[inside, 2])
+    return np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)

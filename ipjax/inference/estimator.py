@@ -38,6 +38,12 @@ class Result:
     seconds: dict[str, float]  # frame, describe, estimate; compile where it happened
     warnings: tuple[str, ...] = ()  # reasons to doubt the estimate, a sentence each
 
+    @property
+    def value(self) -> float:
+        """Confidence × agreement, by which estimates in several crops are compared; 0 without a pose."""
+        found = self.estimate
+        return float(found.confidence) * float(found.hypotheses.score[0]) if bool(found.success) else 0.0
+
 
 class Estimator:
     """Objects and an encoder, ready for frames; compiles once for each shape of templates.

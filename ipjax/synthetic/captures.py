@@ -14,9 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from ipjax.cameras import middle, project, unproject
+from ipjax.cameras import middle
 from ipjax.files.meshes.mesh import Mesh, make_mesh
 from ipjax.files.storage.writing import write_text, writing
+from ipjax.inference.depth import register_depth
 from ipjax.records import Camera, Similarity
 from ipjax.rendering.render import render_frames
 from ipjax.synthetic.objects import KINDS, make_object
@@ -280,36 +281,3 @@ def _make_gripper(rng: np.random.Generator) -> list[Mesh]:
         texture = make_texture(int(rng.integers(2**31)), 128)
         fingers.append(make_mesh(vertices, faces, uv=np.tile(square, (6, 1)), texture=texture))
     return fingers
-
-
-def register_depth(
-    depth: np.ndarray,
-    depth_camera: Camera,
-    colour_from_depth: Similarity[np.ndarray],
-    camera: Camera,
-    size: tuple[int, int],
-) -> np.ndarray:
-    """Raw depth in the colour camera's pixels, as the makers of RGB-D cameras do it: every pixel of the depth camera
-    covers what of the colour image it projects to, and the nearest wins.
-    """
-    width, height = size
-    rows, columns = np.nonzero(depth > 0)
-    points = unproject(
-        depth_camera.to_matrix(), np.stack([columns, rows], -1).astype(np.float64), depth[rows, columns].astype(float)
-    )
-    moved = colour_from_depth @ points
-    moved = moved[moved[:, 2] > 0.05]
-    x, y = project(camera.to_matrix(), moved).T
-    # Half of what a pixel covers, with a little more so that no seams are left.
-    zoom = np.asarray(camera.focal, float) / np.asarray(depth_camera.focal, float)
-    half = 0.55 * zoom * np.ones((len(moved), 2))
-    nearest = np.full((height, width), np.inf)
-    first_x, first_y = np.ceil(x - half[:, 0]).astype(int), np.ceil(y - half[:, 1]).astype(int)
-    reach_x, reach_y = (int(np.ceil(2 * side)) + 1 for side in half.max(0))
-    for dy in range(reach_y):
-        for dx in range(reach_x):
-            column, row = first_x + dx, first_y + dy
-            inside = (column <= x + half[:, 0]) & (row <= y + half[:, 1])
-            inside &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            np.minimum.at(nearest, (row[inside], column[inside]), moved[inside, 2])
-    return np.where(np.isfinite(nearest), nearest, 0).astype(np.float32)

@@ -7,8 +7,8 @@ import numpy as np
 
 from ipjax.capture.checks.inspection import Inspection
 from ipjax.capture.poses.features import FEWEST
-from ipjax.capture.reading.files import abbreviate
 from ipjax.files.cameras.intrinsics import Intrinsics, list_misfits
+from ipjax.files.wording import abbreviate
 
 UNUSABLE, WARNING, FACT = "cannot be used", "looks wrong", "is there"  # kinds of findings
 _FRAMES, _GOOD_FRAMES = 3, 8  # fewer cannot be joined; fewer leave sides unseen

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ipjax.capture.poses.scale import tell_names
 from ipjax.capture.records import Capture, CaptureError, CaptureFrame, Trajectory
+from ipjax.files.wording import abbreviate
 from ipjax.transforms import Similarity, rotation_from_vector
 
 FEWEST = 6  # corners of the board that a frame needs
@@ -91,7 +91,7 @@ def find_by_board(capture: Capture, board: Board, progress: Any = None) -> Traje
     if registered.sum() < max(2, count / 2):
         lost = [name for name, known in zip(capture.names, registered, strict=True) if not known]
         raise CaptureError(
-            f"the board was found in {int(registered.sum())} of {count} frames, not in {tell_names(lost)}: are its "
+            f"the board was found in {int(registered.sum())} of {count} frames, not in {abbreviate(lost, 8)}: are its "
             "kind, squares and dictionary as they were given?"
         )
     return Trajectory(capture.names, Similarity(rotation, translation, np.ones(count)), registered, "board")

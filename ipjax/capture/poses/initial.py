@@ -7,15 +7,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ipjax.cameras import project, unproject
 from ipjax.capture.moving import find_moving
 from ipjax.capture.poses import rgbd, structure
 from ipjax.capture.poses.boards import Board, find_by_board
 from ipjax.capture.poses.features import Features, Match, detect, match
 from ipjax.capture.poses.given import check_given, read_given
-from ipjax.capture.poses.scale import make_metric, tell_names
+from ipjax.capture.poses.scale import make_metric
 from ipjax.capture.poses.tracks import clean, join, reproject, triangulate
 from ipjax.capture.records import Capture, CaptureError, CaptureFrame, Tracks, Trajectory
+from ipjax.files.wording import abbreviate
+from ipjax.inference.depth import register_depth
 from ipjax.transforms import Similarity
 
 Method = Literal["auto", "given", "board", "structure", "depth"]
@@ -144,16 +145,8 @@ def _with_depth(capture: Capture, frame: CaptureFrame) -> CaptureFrame:
     if frame.depth is not None or frame.raw_depth is None or capture.depth_camera is None:
         return frame
     factory = capture.colour_from_depth or Similarity(np.eye(3), np.zeros(3), np.ones(()))
-    rows, columns = np.nonzero(frame.raw_depth > 0)
-    pixels = np.stack([columns, rows], axis=1).astype(np.float64)
-    depths = frame.raw_depth[rows, columns].astype(np.float64)
-    points = factory @ unproject(capture.depth_camera.to_matrix(), pixels, depths)
-    x, y = np.round(project(capture.camera.to_matrix(), points)).astype(int).T
-    width, height = capture.size
-    inside = (points[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    depth = np.full((height, width), np.inf)
-    np.minimum.at(depth, (y[inside], x[inside]), points[inside, 2])  # the nearest hides the others
-    return dataclasses.replace(frame, depth=np.where(np.isfinite(depth), depth, 0))
+    depth = register_depth(frame.raw_depth, capture.depth_camera, factory, capture.camera, capture.size)
+    return dataclasses.replace(frame, depth=depth)
 
 
 def _tell_place(capture: Capture, registered: Sequence[bool]) -> list[str]:
@@ -184,7 +177,7 @@ def describe(found: InitialPoses) -> list[str]:
     lines = [f"{count} of {len(trajectory)} frames have a pose, by {trajectory.source}"]
     lost = [name for name, there in zip(trajectory.names, known, strict=True) if not there]
     if lost:
-        lines.append(f"without a pose are {tell_names(lost, 20)}")
+        lines.append(f"without a pose are {abbreviate(lost, 20)}")
     places = trajectory.world_from_camera.translation[known]
     steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
     span = np.linalg.norm(np.ptp(places, axis=0))

@@ -23,6 +23,8 @@ PIXELS = 1.0  # standard deviation of a feature's place
 DEPTH = 0.01  # of a measured depth, as a share of it
 LEAST_KEPT = 0.3  # of a frame's observations that must agree with its pose
 _WIDTHS = (10.0, 5.0, 3.0)  # of the robust loss, standard deviations, from coarse to fine
+_REFINED = 3  # times that the motion of two frames is refined and its inliers are chosen anew
+_NOISE = 0.5  # pixels by which an inlier may be off in any case
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,9 +91,34 @@ def relate(found: Match, features: Sequence[Features], K: Float[np.ndarray, "3 3
         return None
     if not good or inside is None or len(inside) < max(FEWEST, 0.3 * known.sum()):
         return None
-    there_from_here = Similarity(rotation_from_vector(turn.reshape(3)), shift.reshape(3), np.ones(()))
+    there_from_here = _refine(points, pixels[1 - here][known], K, turn, shift, inside.ravel())
     motion = there_from_here.inverse() if here else there_from_here
     return Edge(found.first, found.second, motion, len(inside))
+
+
+def _refine(
+    points: Float[np.ndarray, "n 3"],
+    pixels: Float[np.ndarray, "n 2"],
+    K: Float[np.ndarray, "3 3"],
+    turn: np.ndarray,
+    shift: np.ndarray,
+    inside: np.ndarray,
+) -> Similarity[np.ndarray]:
+    """The motion of least reprojection error, on inliers that are chosen anew each time.
+
+    What RANSAC returns has the least algebraic error within four pixels, which makes motions shorter than they are: by
+    a tenth between frames 11° apart.
+    """
+    import cv2
+
+    chosen = inside
+    motion = Similarity(rotation_from_vector(turn.reshape(3)), shift.reshape(3), np.ones(()))
+    for _ in range(_REFINED):
+        turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], K, None, turn, shift)
+        motion = Similarity(rotation_from_vector(turn.reshape(3)), shift.reshape(3), np.ones(()))
+        off = np.linalg.norm(project(K, motion @ points) - pixels, axis=1)
+        chosen = np.flatnonzero(off <= max(3 * np.median(off[inside]), _NOISE))  # always half of them, at least
+    return motion
 
 
 def _span(edges: Sequence[Edge], count: int) -> tuple[Similarity[np.ndarray], Bool[np.ndarray, " n"]]:

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float
 
 from ipjax.capture.poses.structure import Structure
 from ipjax.capture.records import CaptureError, Trajectory
+from ipjax.files.wording import abbreviate
 from ipjax.transforms import Similarity
 
 TOLERANCE = 0.02  # of the scale, within which a vote agrees: the noise of depth and of triangulated points
@@ -103,12 +104,7 @@ def check_registered(names: Sequence[str], registered: Bool[np.ndarray, " n"]) -
     if count < max(FEWEST_FRAMES, LEAST_REGISTERED * len(names)):
         lost = [name for name, known in zip(names, registered, strict=True) if not known]
         raise CaptureError(
-            f"only {count} of {len(names)} frames could be placed; without a place are {tell_names(lost)}: take frames "
-            "closer to one another, of a scene with more texture, or give poses (poses.json) or a board (--board)"
+            f"only {count} of {len(names)} frames could be placed; without a place are {abbreviate(lost, 8)}: "
+            "take frames closer to one another, of a scene with more texture, or give poses (poses.json) or a board "
+            "(--board)"
         )
-
-
-def tell_names(names: Sequence[str], most: int = 8) -> str:
-    """Names in a sentence, at most so many."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -13,6 +13,7 @@ from ipjax.files.cameras.reading import as_intrinsics, read_camera
 from ipjax.files.images.depth import read_depth, remove_sentinel
 from ipjax.files.images.masks import read_mask
 from ipjax.files.images.opening import read_rgb, read_size
+from ipjax.files.wording import abbreviate
 from ipjax.inference.cutting import undistort_frame
 from ipjax.inference.depth import check_frame_unit, find_depth_scale, to_metres
 from ipjax.transforms import Similarity
@@ -270,12 +271,6 @@ def check_names(folder: Path, what: str, wanted: Iterable[str], there: Iterable[
     missing = [name for name in wanted if name not in there]
     if missing:
         raise CaptureError(f"{folder}: {what} is missing of {abbreviate(missing)}; add it, or remove the frames")
-
-
-def abbreviate(names: Sequence[str], most: int = 3) -> str:
-    """Some names, and how many more there are."""
-    said = ", ".join(names[:most])
-    return said if len(names) <= most else f"{said} and {len(names) - most} more"
 
 
 def _common_size(paths: Sequence[Path], what: str) -> tuple[int, int]:

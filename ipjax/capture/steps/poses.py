@@ -3,7 +3,8 @@
 from ipjax.capture.poses.boards import parse_board
 from ipjax.capture.poses.initial import find_poses
 from ipjax.capture.poses.storing import write_poses
-from ipjax.capture.steps.records import Figure, Job, Outcome, Step, list_names, say
+from ipjax.capture.steps.records import Figure, Job, Outcome, Step, say
+from ipjax.files.wording import abbreviate
 
 _FEWEST = 3  # frames with a pose
 _AGREEING = 0.7  # share of the depth that agrees on the scale, below which poses are to be looked at
@@ -43,7 +44,9 @@ def pose(job: Job) -> Outcome:
     warnings = []
     lost = [name for name, known in zip(trajectory.names, trajectory.registered, strict=True) if not known]
     if lost:
-        warnings.append(f"{len(lost)} of {len(trajectory)} frames have no pose and are left out: {list_names(lost)}.")
+        warnings.append(
+            f"{len(lost)} of {len(trajectory)} frames have no pose and are left out: {abbreviate(lost, 12)}."
+        )
     if trajectory.agreement is not None and trajectory.agreement < _AGREEING:
         warnings.append(
             f"Only {100 * trajectory.agreement:.0f} % of the measured depths agree with the poses: look at the picture."

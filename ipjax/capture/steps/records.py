@@ -94,8 +94,3 @@ class Step:
 def say(line: str) -> str:
     """A line as a sentence."""
     return f"{line[0].upper()}{line[1:]}."
-
-
-def list_names(names: list[str]) -> str:
-    """The first of many."""
-    return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")

@@ -5,8 +5,9 @@ import numpy as np
 from ipjax.capture.moving import hide, read_ignored
 from ipjax.capture.poses.tracks import read_tracks
 from ipjax.capture.refinement.storing import refine_in
-from ipjax.capture.steps.records import Figure, Job, Outcome, Step, list_names, say
+from ipjax.capture.steps.records import Figure, Job, Outcome, Step, say
 from ipjax.capture.trajectories import read_trajectory
+from ipjax.files.wording import abbreviate
 
 
 def refine_poses(job: Job) -> Outcome:
@@ -35,7 +36,7 @@ def refine_poses(job: Job) -> Outcome:
     if unsure:
         kept = "kept, as told" if job.settings.keep_unsure else "left out of models and labels"
         warnings.append(
-            f"The pose of {len(unsure)} of {int(known.sum())} frames is not sure; {kept}: {list_names(unsure)}."
+            f"The pose of {len(unsure)} of {int(known.sum())} frames is not sure; {kept}: {abbreviate(unsure, 12)}."
         )
     return Outcome(
         ("refined.json", "refinement.json", "refinement.png"),

@@ -133,16 +133,11 @@ def _estimate_again(
             continue
         given = {"seed": arguments.seed, "diameter": diameters[one.index]}
         result = estimator.run(one.index, crop.view, crop.camera_from_crop, **given)
-        step = Step.of("that mask, with the settings asked for", one.mask, result, _score(result))
+        step = Step.of("that mask, with the settings asked for", one.mask, result, result.value)
         found.append(dataclasses.replace(one, result=result, score=step.score, steps=(*one.steps, step)))
         seconds[id(found[-1])] = spent
     found.sort(key=lambda one: -one.score)
     return dataclasses.replace(detections, found=tuple(found), rejected=(*rejected, *lost)), seconds
-
-
-def _score(result: Any) -> float:
-    found = result.estimate
-    return float(found.confidence) * float(found.hypotheses.score[0]) if bool(found.success) else 0.0
 
 
 def _explain(name: str, detections: Any, arguments: argparse.Namespace) -> Path:

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ipjax.files.wording import abbreviate
+
 PREFIX = re.compile(r"^(camera|cam|colou?r|rgb|image|img|im(?=size|shape|width|height)|frame)(?=.)")
 MATRIX = re.compile(r"^(k|matrix|kmatrix|matrixk|intrinsics?(matrix|parameters)?|calibrationmatrix)$")
 FX, FY, CX, CY = (
@@ -116,7 +118,7 @@ def find_camera(entry: dict) -> Fields | None:
         coloured = [item for item in inner if re.search(r"colou?r|rgb", item[0].lower())]
         if len(coloured) != 1:
             raise ValueError(
-                f"it holds several cameras ({abbreviate([key for key, _, _ in inner])}); keep that of the image"
+                f"it holds several cameras ({abbreviate([key for key, _, _ in inner], 6)}); keep that of the image"
             )
         inner = coloured
     if not inner:
@@ -141,9 +143,3 @@ def as_numbers(value: Any, what: str) -> np.ndarray:
         return np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError):
         raise ValueError(f"{what} must be numbers") from None
-
-
-def abbreviate(items: list) -> str:
-    """The first six, separated by commas."""
-    shown = ", ".join(str(item) for item in items[:6])
-    return shown + (" …" if len(items) > 6 else "")

@@ -19,7 +19,6 @@ from ipjax.files.cameras.fields import (
     SIZE,
     WIDTH,
     Fields,
-    abbreviate,
     as_number,
     as_numbers,
     find_camera,
@@ -27,6 +26,7 @@ from ipjax.files.cameras.fields import (
 from ipjax.files.cameras.intrinsics import Intrinsics
 from ipjax.files.cameras.lenses import is_nonzero, read_lens
 from ipjax.files.storage.parsing import parse, read_text
+from ipjax.files.wording import abbreviate
 from ipjax.records import Camera
 
 
@@ -127,13 +127,13 @@ def _read_entry(entry: Any, image: int | None) -> Intrinsics:
         if image is None:
             raise ValueError(f"it holds the cameras of {len(images)} images; say which one")
         if image not in images:
-            raise ValueError(f"it holds no camera for image {image}; it has {abbreviate(sorted(images))}")
+            raise ValueError(f"it holds no camera for image {image}; it has {abbreviate(sorted(images), 6)}")
         if not isinstance(images[image], dict):
             raise ValueError(f"the entry of image {image} is no camera")
         return _read_entry(images[image], None)
     found = find_camera(entry)
     if found is None:
-        names = abbreviate(list(entry))
+        names = abbreviate(list(entry), 6)
         raise ValueError(f"no camera among its entries ({names}); cam_K, K, or fx, fy, cx and cy are expected")
     return _read_fields(found)
 
