@@ -8,9 +8,9 @@ PAGE``.
 
 import argparse
 import json
-import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
-from benchmarks.measure import describe_device
+from benchmarks.measure import commit, describe_device
 from ipjax.capture.labels.masks import find_box, label_frames
 from ipjax.capture.models.frames import PosedFrame, trust_depth
 from ipjax.capture.models.making import ModelConfig, SceneModels
 from ipjax.capture.models.separation import Hint
-from ipjax.files.storage.writing import append_json, write_text
+from ipjax.files.storage.writing import append_json, read_lines, write_text
 from ipjax.inference.depth import register_depth
 from ipjax.synthetic.captures import MadeCapture, make_capture
 from ipjax.transforms import Similarity
@@ -234,15 +234,12 @@ def measure_open3d(
 
 def write_page(results: list[dict[str, Any]], beside: list[dict[str, Any]], command: str) -> str:
     """The page; ``beside``: captures from which Open3D's figures are taken."""
-    device = describe_device()
-    root = Path(__file__).resolve().parent.parent
-    state = subprocess.run(["git", "rev-parse", "--short=10", "HEAD"], cwd=root, capture_output=True, text=True)
+    states = dict.fromkeys(f"{row['device']}, jax {row['jax']}, commit {row['commit']}" for row in results)
     seeds = ", ".join(str(item["seed"]) for item in results)
     lines = [
         "# Models and labels of made captures",
         "",
-        f"Made by `{command}`, commit {state.stdout.strip() or 'unknown'}, on "
-        f"{', '.join(f'{k}: {v}' for k, v in device.items())}.",
+        f"Made by `{command}`, then `page`; do not edit by hand. Measured on: {'; '.join(states)}.",
         "",
         f"Seeds {seeds}. Every capture: five objects of 0.12 to 0.22 m on a table, one pair touching (two pairs "
         "in odd seeds), the others 3 cm apart or more; 24 frames of 640 × 480 with noise, frayed edges and holes; "
@@ -342,6 +339,13 @@ def mean_error(values: Any) -> str:
     return f"**{text}**" if abs(values.mean()) > 3 * error else text
 
 
+def unmeasured(seeds: Sequence[int], output: Path, at: str | int) -> list[int]:
+    """Those seeds of which the file has no line of this commit."""
+    rows = [json.loads(line) for line in read_lines(output)] if output.exists() else []
+    done = {row["seed"] for row in rows if row.get("commit") == at}
+    return [seed for seed in seeds if seed not in done]
+
+
 def main() -> None:
     """Measure seeds, or write the page of what was measured."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -359,10 +363,12 @@ def main() -> None:
     page.add_argument("--page", type=Path)
     options = parser.parse_args()
     if options.step == "measure":
-        for seed in options.seeds:
+        state = {**describe_device(), "commit": commit()}
+        for seed in unmeasured(options.seeds, options.output, state["commit"]):
             found = measure_seed(
                 seed, options.views, tuple(options.size), exact=options.exact, with_open3d=options.open3d
             )
+            found |= state
             append_json(options.output, found)
             print(f"seed {seed}: {found['cpu_seconds']}", file=sys.stderr, flush=True)
         return

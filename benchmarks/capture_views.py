@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.capture_models import make_frames
+from benchmarks.capture_models import make_frames, unmeasured
 from benchmarks.measure import commit, describe_device
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.views.drawing import ViewConfig, draw_views
@@ -148,7 +148,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.step == "measure":
         state = {**describe_device(), "commit": commit()}
-        for seed in options.seeds:
+        for seed in unmeasured(options.seeds, options.output, state["commit"]):
             found = {**measure_seed(seed, options.views, tuple(options.size)), **state}
             append_json(options.output, found)
             print(f"seed {seed}: {found['cpu_a_view']}", file=sys.stderr, flush=True)

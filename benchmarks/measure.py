@@ -85,13 +85,18 @@ def describe_device() -> dict[str, str | int]:
 def commit() -> str:
     """The commit of this checkout, with a mark where files differ from it; "unknown" outside of one."""
     try:
-        said = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=10"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        named = _git("rev-parse", "--short=10", "HEAD").strip()
+        return f"{named}-dirty" if changed_files() else named
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return said.stdout.strip()
+
+
+def changed_files() -> list[str]:
+    """Files that differ from the commit. Pages of results, and README's figures, are made from it and do not count."""
+    lines = _git("status", "--porcelain", "--untracked-files=no", "--", ":/", ":!/benchmarks/results", ":!/README.md")
+    return [line[3:] for line in lines.splitlines()]
+
+
+def _git(*arguments: str) -> str:
+    folder = Path(__file__).parent
+    return subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True).stdout

@@ -191,6 +191,7 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--output", type=Path, default=Path("build/photo_shapes.jsonl"))
+    parser.add_argument("--page", type=Path, default=Path("benchmarks/results/shapes.md"), help="page: write it here")
     options = parser.parse_args()
     options.output.parent.mkdir(parents=True, exist_ok=True)
     if options.what == "made":
@@ -219,7 +220,7 @@ def main() -> None:
             f"Commit {states}.",
             "",
         ]
-        write_text(Path("benchmarks/results/shapes.md"), "\n".join([*head, *text]) + "\n")
+        write_text(options.page, "\n".join([*head, *text]) + "\n")
 
 
 if __name__ == "__main__":
