@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from ipjax.inference.drawing import draw
     from ipjax.inference.estimator import Estimator
     from ipjax.inference.frames import frame, frame_turned
+    from ipjax.labelling.batch import Labeller, label_batch
+    from ipjax.labelling.records import LabelSettings
     from ipjax.onboarding.mesh import onboard
     from ipjax.onboarding.photo import onboard_photo
     from ipjax.onboarding.photographed import onboard_with_photo
@@ -75,6 +77,8 @@ __all__ = [
     "Grasps",
     "Gripper",
     "Intrinsics",
+    "LabelSettings",
+    "Labeller",
     "MatchConfig",
     "Mesh",
     "OnboardConfig",
@@ -102,6 +106,7 @@ __all__ = [
     "explain",
     "frame",
     "frame_turned",
+    "label_batch",
     "load",
     "load_encoder",
     "load_mesh",
@@ -185,6 +190,11 @@ _HOMES = {
         "frame",
         "frame_turned",
     ),
+    "labelling.batch": (
+        "Labeller",
+        "label_batch",
+    ),
+    "labelling.records": ("LabelSettings",),
     "onboarding.mesh": ("onboard",),
     "onboarding.photo": ("onboard_photo",),
     "onboarding.photographed": ("onboard_with_photo",),

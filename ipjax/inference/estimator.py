@@ -1,6 +1,7 @@
 """Estimating objects in frames on the host: crop, describe, estimate, and how long each took."""
 
 import dataclasses
+import threading
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -15,7 +16,7 @@ from ipjax.estimation.pipeline import estimate
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.inference.batching import compact, pad_alike
 from ipjax.inference.frames import frame_turned
-from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates
+from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates, View
 
 # Compacted templates have a multiple of so many patches: each count is compiled anew, and most objects now share two.
 MULTIPLE = 64
@@ -48,6 +49,8 @@ class Result:
 class Estimator:
     """Objects and an encoder, ready for frames; compiles once for each shape of templates.
 
+    Several threads may use one: what is compiled is compiled once, and others wait for it.
+
     Templates are compacted when they are first used (`ipjax.compact`): the estimates are the same, in about half the
     time for matching.
 
@@ -77,6 +80,7 @@ class Estimator:
         self.quick = quick
         self.options: dict[str, Any] = {"crop": "square"} | options
         self._compiled: dict[Any, Any] = {}
+        self._compiling = threading.RLock()
         self._compacted: dict[int, Templates] = {}
         if alike:
             padded = pad_alike([compact(templates, multiple=MULTIPLE) for templates, _ in self.objects])
@@ -114,10 +118,7 @@ class Estimator:
             drawn: without it no candidate is drawn: half the time, and a rougher confidence. Poses of objects from a
                 photo are found or chosen by drawing, and stay as they are.
         """
-        templates, info = self.objects[index]
-        if self._compacted.get(index) is not templates:
-            templates = self._compacted[index] = compact(templates, multiple=MULTIPLE)
-            self.objects[index] = templates, info
+        templates = self._compact(index)
         seconds: dict[str, float] = {}
         key = jax.random.key(seed)
         known = None if diameter is None else jnp.asarray(diameter, jnp.float32)
@@ -138,6 +139,83 @@ class Estimator:
         start = time.perf_counter()
         found = jax.block_until_ready(estimate_compiled(*arguments))
         seconds["estimate"] = time.perf_counter() - start
+        return self._finish(index, found, query, camera_from_crop, seconds, diameter)
+
+    def run_batch(
+        self,
+        index: int,
+        crops: Sequence[tuple[View, Similarity]],
+        *,
+        seeds: Sequence[int],
+        diameter: float | None = None,
+        size: int | None = None,
+    ) -> list[Result]:
+        """Estimate one object in several crops at once: the same as `run` of each, up to rounding.
+
+        Args:
+            index: of the object.
+            crops: each from `frame`.
+            seeds: of each.
+            diameter: as in `run`.
+            size: of the program that is compiled, at least as many as there are crops; what is missing is filled with
+                repeats, whose results are dropped. None = as many as there are.
+
+        Returns:
+            A result for each crop; ``seconds`` are each one's share.
+
+        Raises:
+            ValueError: there are no crops, more than ``size``, or not as many seeds.
+        """
+        size = len(crops) if size is None else size
+        if not 0 < len(crops) <= size or len(seeds) != len(crops):
+            raise ValueError(f"{len(crops)} crops and {len(seeds)} seeds do not fit a batch of {size}")
+        if size == 1:
+            return [self.run(index, *crops[0], seed=seeds[0], diameter=diameter)]
+        templates = self._compact(index)
+        seconds: dict[str, float] = {}
+        more = size - len(crops)
+        views = [view for view, _ in crops] + [crops[0][0]] * more
+        views = jax.tree.map(lambda *x: jnp.stack(x), *views)
+        keys = jnp.stack([jax.random.key(seed) for seed in (*seeds, *[seeds[0]] * more)])
+        known = None if diameter is None else jnp.asarray(diameter, jnp.float32)
+        describe_compiled = self.compiled("describe all", _describe_all, seconds, self.encoder, views)
+        start = time.perf_counter()
+        patches = jax.block_until_ready(describe_compiled(self.encoder, views))
+        seconds["describe"] = time.perf_counter() - start
+        queries = Query(patches=patches, view=views)
+        arguments = self.encoder, templates, queries, keys, self.config, known
+        estimate_compiled = self.compiled("estimate all", _estimate_all, seconds, *arguments)
+        start = time.perf_counter()
+        found = jax.block_until_ready(estimate_compiled(*arguments))
+        seconds["estimate"] = time.perf_counter() - start
+        shares = {name: value / len(crops) for name, value in seconds.items()}
+        many = jax.device_get((found, queries))  # at once: a transfer for each number of each crop takes longer
+        results = []
+        for place, (_, camera_from_crop) in enumerate(crops):
+            estimated, query = jax.tree.map(lambda x, place=place: jnp.asarray(x[place]), many)
+            results.append(self._finish(index, estimated, query, camera_from_crop, dict(shares), diameter))
+        return results
+
+    def _compact(self, index: int) -> Templates:
+        """An object's templates, compacted."""
+        templates, info = self.objects[index]
+        if self._compacted.get(index) is not templates:
+            with self._compiling:
+                templates = self._compacted[index] = compact(self.objects[index][0], multiple=MULTIPLE)
+                self.objects[index] = templates, info
+        return templates
+
+    def _finish(
+        self,
+        index: int,
+        found: PoseEstimate,
+        query: Query,
+        camera_from_crop: Similarity,
+        seconds: dict[str, float],
+        diameter: float | None,
+    ) -> Result:
+        """What was found in a crop as a result in the camera of the whole image."""
+        templates, info = self.objects[index]
         found, warning = check_size(found, info, diameter, self.config.confidence.least)
         warnings = (warning,) if warning else ()
         whole = to_image_camera(camera_from_crop, found)
@@ -150,10 +228,23 @@ class Estimator:
         key = (name, structure, shapes)
         if key not in self._compiled:
             start = time.perf_counter()
-            options = QUICK if self.quick and jax.default_backend() == "cpu" else None
-            self._compiled[key] = jax.jit(function).lower(*args).compile(compiler_options=options)
+            with self._compiling:
+                if key not in self._compiled:
+                    options = QUICK if self.quick and jax.default_backend() == "cpu" else None
+                    self._compiled[key] = jax.jit(function).lower(*args).compile(compiler_options=options)
             seconds["compile"] = seconds.get("compile", 0.0) + time.perf_counter() - start
         return self._compiled[key]
+
+
+def _describe_all(encoder: Any, views: View) -> Patches:
+    """`describe` of several crops."""
+    return jax.vmap(describe, in_axes=(None, 0))(encoder, views)
+
+
+def _estimate_all(encoder: Any, templates: Templates, queries: Query, keys: Any, config: Config, diameter: Any):
+    """`estimate` of one object in several crops, whose templates are not copied."""
+    one = lambda query, key: estimate(encoder, templates, query, key, config, diameter)
+    return jax.vmap(one)(queries, keys)
 
 
 def check_size(

@@ -32,6 +32,7 @@ ORDER = [
     ["ipjax.bop"],
     ["ipjax.capture"],
     ["ipjax.robot"],
+    ["ipjax.labelling"],
     ["ipjax.commands"],
     ["ipjax.cli"],
     ["ipjax.__main__"],
