@@ -4,6 +4,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from ipjax.cameras import crop as crop_camera
 from ipjax.cameras import (
@@ -93,6 +94,18 @@ def cut_look_at(rgb, depth, mask, bounds, K, scale, resolution, pad, erosion, ed
     cut_depth = sample_depth(piece, x, y, edge_tolerance) * (seen @ crop_from_camera[2]).astype(np.float32)
     cut_depth = np.where(inside, cut_depth, np.float32(0))
     return cut_rgb, cut_depth, cut_mask, matrix, camera_from_crop
+
+
+def undistort_pixels(pixels: Float[np.ndarray, "n 2"], intrinsics: Intrinsics) -> Float[np.ndarray, "n 2"]:
+    """Where pixels (x, y) of an image lie in that of the pinhole camera with the same K."""
+    K, coefficients = intrinsics.matrix, np.asarray(intrinsics.distortion)
+    if not coefficients.size or not len(pixels):
+        return np.asarray(pixels, np.float64)
+    given = np.asarray(pixels, np.float64).reshape(-1, 1, 2)
+    # OpenCV's usual five rounds stop far off at the rim.
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    change = cv2.fisheye.undistortPoints if intrinsics.lens == "equidistant" else cv2.undistortPoints
+    return change(given, K, coefficients, R=np.eye(3), P=K, criteria=until).reshape(-1, 2)
 
 
 def undistort_frame(rgb: np.ndarray, depth: np.ndarray, mask: np.ndarray | None, region: Any, intrinsics: Intrinsics):

@@ -9,10 +9,11 @@ from jaxtyping import Bool, Float
 
 from ipjax.capture.moving import find_moving
 from ipjax.capture.poses import rgbd, structure
-from ipjax.capture.poses.boards import Board, find_by_board
+from ipjax.capture.poses.boards import Board
 from ipjax.capture.poses.features import Features, Match, detect, match
 from ipjax.capture.poses.given import check_given, read_given
 from ipjax.capture.poses.scale import make_metric
+from ipjax.capture.poses.sightings import find_by_board
 from ipjax.capture.poses.tracks import clean, join, reproject, triangulate
 from ipjax.capture.records import Capture, CaptureError, CaptureFrame, Tracks, Trajectory
 from ipjax.files.wording import abbreviate
