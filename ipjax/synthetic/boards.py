@@ -62,7 +62,9 @@ def photograph(
         change = resize(np.eye(3), paper.shape[::-1], smaller)
         paper = cv2.resize(paper, smaller, interpolation=cv2.INTER_AREA)
         at = (at * change[[0, 1], [0, 1]] + change[[0, 1], [2, 2]]).astype(np.float32)
-    drawn = cv2.remap(paper, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(_TABLE,))
+    drawn = cv2.remap(
+        paper, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(_TABLE,)
+    )
     grey = drawn.reshape(height, _FINE, width, _FINE).mean((1, 3))
     grey = grey + np.random.default_rng(seed).normal(0, noise, grey.shape) if noise else grey
     return np.repeat(np.clip(np.rint(grey), 0, 255).astype(np.uint8)[..., None], 3, axis=2)

@@ -57,7 +57,7 @@ class Board:
 
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         kind = cv2.aruco.CharucoBoard if self.kind in _CHARUCO else cv2.aruco.GridBoard
-        made = kind((self.columns, self.rows), self.length, self.other, dictionary)
+        made: Any = kind((self.columns, self.rows), self.length, self.other, dictionary)
         if self.kind == "charuco-legacy":
             made.setLegacyPattern(True)
         return made

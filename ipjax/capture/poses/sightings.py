@@ -36,7 +36,7 @@ class Sighting:
         Of rotation (rad) and translation (m) about the board's origin, as `ipjax.transforms.difference` has them.
         """
         steps = _STEP * np.concatenate([np.eye(6), -np.eye(6)])
-        many = Similarity.stack([self.camera_from_board] * 12)
+        many = Similarity[np.ndarray].stack([self.camera_from_board] * 12)
         drawn = project(K, retract(many, steps) @ self.points).reshape(12, -1)
         slope = (drawn[:6] - drawn[6:]) / (2 * _STEP)
         return np.linalg.inv(slope @ slope.T)
@@ -154,10 +154,14 @@ def _find_chessboard(grey: np.ndarray, board: Board) -> tuple[Any, Any]:
     import cv2
 
     across, down = board.columns - 1, board.rows - 1
-    flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-    found, corners = cv2.findChessboardCornersSB(grey, (across, down), flags=flags)
+    found, corners = cv2.findChessboardCornersSB(grey, (across, down), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
     if not found:
         return None, None
+    grid = corners.reshape(down, across, 2)
+    apart = min(np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1))
+    window = int(np.clip(0.2 * apart, 2, 10))  # of one corner's surroundings; with it, corners are twice as exact
+    until = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-4)
+    corners = cv2.cornerSubPix(grey, corners.copy(), (window, window), (-1, -1), until)
     grid = corners.reshape(down, across, 2).astype(np.float64)
     right, below = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if right[0] * below[1] < right[1] * below[0]:  # as in a mirror

@@ -19,8 +19,9 @@ examples:
 
 Methods: given = the poses that the capture has; board = a printed board is the world, KIND:COLUMNSxROWS:LENGTH:LENGTH:
 DICTIONARY, with the squares and markers of a charuco board, or the markers of an aruco board and the gaps between them,
-in metres; depth = features and their depth; structure = structure from motion, its scale by depth. auto = the board if
-one is described, else the poses given, else depth, and structure where that leaves frames out.
+in metres, or chessboard:COLUMNSxROWS:LENGTH of squares; depth = features and their depth; structure = structure from
+motion, its scale by depth. auto = the board if one is described, else the poses given, else depth, and structure where
+that leaves frames out.
 
 Writes poses.json, tracks.npz (points recognised in several frames), trajectory.png, and ignore.png where something is
 found that moves with the camera; removes what ipjax capture refine made of earlier poses. Exits with 1 where frames are

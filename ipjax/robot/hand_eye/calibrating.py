@@ -62,7 +62,7 @@ def calibrate(
     notes = check_motion(base_from_gripper.take(own[paired]))
     views = Views(base_from_gripper.take(own[paired]), camera_from_board.take(paired))
     agreed = agree(views, eye)
-    if agreed is None or not agreed.agrees.all() or not paired.all():
+    if agreed is None or (~agreed.counted).sum() > 1 or not paired.all():
         shifted = find_shift(camera_from_board, base_from_gripper, own, eye)
         if shifted is not None:
             said = tell_shift(names, match(camera_from_board, base_from_gripper, shifted), own)
@@ -73,13 +73,13 @@ def calibrate(
             f"there are {count} images and {poses} poses without names, and no order in which they fit: give poses by "
             "the images' names"
         )
-    if agreed is None or agreed.agrees.sum() < max(FEWEST, _SHARE * count):
-        raise HandEyeError(_tell_misfit(views, eye, agreed.agrees.sum() if agreed is not None else 0))
+    if agreed is None or len(agreed.used) < max(FEWEST, _SHARE * count):
+        raise HandEyeError(_tell_misfit(views, eye, 0 if agreed is None else len(agreed.used)))
     views = dataclasses.replace(views, covariance=covariance)
-    begin = agreed.found.mount_from_camera, agreed.found.holder_from_board
-    found = solve(views, eye, begin, counted=agreed.agrees)
+    begin = agreed.mount_from_camera, agreed.holder_from_board
+    found = solve(views, eye, begin, counted=agreed.counted)
     check_motion(views.base_from_gripper.take(found.used), "views that fit one another")
-    wrong = _tell_wrong(names, found, match(camera_from_board, base_from_gripper, agreed.found), own)
+    wrong = _tell_wrong(names, found, match(camera_from_board, base_from_gripper, agreed), own)
     stretch, deviation = find_stretch(views, found)
     if abs(stretch) > max(_STRETCHED, 4 * deviation):
         notes.append(
@@ -93,7 +93,7 @@ def _tell_misfit(views: Views, eye: Eye, count: int) -> str:
     """Why nothing fits, in one sentence: the direction, poses that are inverted, or what may be."""
     other: Eye = "to-hand" if eye == "in-hand" else "in-hand"
     agreed = agree(views, other)
-    if agreed is not None and agreed.agrees.sum() >= max(FEWEST, _SHARE * len(views)):
+    if agreed is not None and len(agreed.used) >= max(FEWEST, _SHARE * len(views)):
         return (
             f"images and robot poses do not fit --eye {eye}, but they fit --eye {other}, or robot poses that are "
             "gripper_from_base, inverted: base_from_gripper is expected"
@@ -108,7 +108,7 @@ def _tell_misfit(views: Views, eye: Eye, count: int) -> str:
 def _tell_wrong(names: Sequence[str], found: HandEye, fits: np.ndarray, own: np.ndarray) -> dict[str, str]:
     """A sentence for each view that was left out."""
     wrong = {}
-    for number in np.flatnonzero(~found.counted):
+    for number in np.flatnonzero(~found.counted).tolist():
         off = found.left_out[number]
         turn, shift = np.degrees(np.linalg.norm(off[:3])), 1000 * np.linalg.norm(off[3:])
         elsewhere = [i for i, pose in enumerate(own) if i != number and fits[number, pose]]

@@ -9,7 +9,6 @@ was skipped moves all later ones by one.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -17,75 +16,73 @@ from scipy.stats import chi2, f
 
 from ipjax.robot.hand_eye.motion import FEWEST
 from ipjax.robot.hand_eye.records import Eye, HandEye, Noise, Views
-from ipjax.robot.hand_eye.solving import residuals, solve, start
+from ipjax.robot.hand_eye.solving import residuals, solve, start_many
 from ipjax.transforms import Similarity
 
 SHIFTS = (0, 1, -1, 2, -2)  # places by which a pairing is tried to be wrong
 WORST = Noise(np.deg2rad(2), 0.02)  # of a view along each axis, beyond which poses and images do not belong together
 _CHANCE = 1e-4  # that a right pair is taken for a wrong one
+_DOUBT = 0.01  # chance of a right pair's error, below which it may be a wrong one that hides in the noise it makes
 _AGREEING = 0.45  # share of the pairs on which a start must agree: less than half, since half may be shifted
 _SUBSETS = 60
 _ARM = 0.3  # metres, by which angles and lengths of a start's errors are compared
 _ROUNDS = 20
 
 
-@dataclasses.dataclass(frozen=True)
-class Agreement:
-    """A calibration, and the pairs that agree on it."""
+def agree(views: Views, eye: Eye) -> HandEye | None:
+    """The calibration on which most pairs of image and pose agree, and which (`HandEye.counted`).
 
-    found: HandEye
-    agrees: Bool[np.ndarray, " n"]
-
-
-def agree(views: Views, eye: Eye) -> Agreement | None:
-    """The calibration on which most pairs of image and pose agree; None where no four of them make one that is
-    better than `WORST`.
+    None where no four of them make one that is better than `WORST`.
     """
     count = len(views)
     if count < FEWEST:
         return None
-    wanted = min(count, max(FEWEST + 1, int(np.ceil(_AGREEING * count))))
-    begin, errors = _find_start(views, eye, wanted)
-    if begin is None:
-        return None
-    agrees = errors <= np.sort(errors)[wanted - 1]
     plain = dataclasses.replace(views, covariance=None)  # no error of a robot's pose can hide in it, and it is quick
+    if (whole := _solve_whole(plain, eye)) is not None:
+        return whole
+    wanted = min(count, max(FEWEST + 1, int(np.ceil(_AGREEING * count))))
+    begin, errors = _find_start(plain, eye, wanted)
+    agrees = errors <= np.sort(errors)[wanted - 1]
     # The smallest errors of all tell too small a noise (C. Croux and G. Haesbroeck, 1999, of trimmed covariances).
     share = agrees.mean()
     trimmed = 1.0 if share == 1 else chi2.cdf(chi2.ppf(share, 6), 8) / share
+    found = solve(plain, eye, begin, counted=agrees)
     for _ in range(_ROUNDS):
-        found = solve(plain, eye, begin, counted=agrees)
         joined = is_usual(found.distance * trimmed, int(agrees.sum()))
         begin, trimmed = (found.mount_from_camera, found.holder_from_board), 1.0
         if joined.sum() < FEWEST or (joined == agrees).all():
             break
         agrees = joined
-    fair = found.noise.rotation < WORST.rotation and found.noise.translation < WORST.translation
-    return Agreement(found, found.counted) if fair else None
+        found = solve(plain, eye, begin, counted=agrees)
+    return found if _is_fair(found) else None
 
 
-def is_usual(distance: Float[np.ndarray, "*b"], count: int) -> Bool[np.ndarray, "*b"]:
+def _solve_whole(views: Views, eye: Eye) -> HandEye | None:
+    """The calibration on which all pairs agree without any doubt; None where there is one."""
+    found = solve(views, eye)
+    return found if _is_fair(found) and is_usual(found.distance, len(views), _DOUBT).all() else None
+
+
+def _is_fair(found: HandEye) -> bool:
+    return bool(found.noise.rotation < WORST.rotation and found.noise.translation < WORST.translation)
+
+
+def is_usual(distance: Float[np.ndarray, "*b"], count: int, chance: float = _CHANCE) -> Bool[np.ndarray, "*b"]:
     """Whether an error, in standard deviations that ``count`` pairs told, is one that a right pair may have."""
-    return distance < 6 * f.isf(_CHANCE, 6, max(6 * count - 12, 1))
+    return distance < 6 * f.isf(chance, 6, max(6 * count - 12, 1))
 
 
-def _find_start(views: Views, eye: Eye, wanted: int) -> tuple[Any, Any]:
-    """The closed form whose errors, the ``wanted`` smallest of them, are smallest; and all of its errors."""
-    rng, best, least, errors = np.random.default_rng(0), None, np.inf, None
-    count = len(views)
-    subsets: list[np.ndarray] = [np.arange(count)]
-    subsets += [np.sort(rng.choice(count, FEWEST, replace=False)) for _ in range(_SUBSETS if count > FEWEST else 0)]
-    for subset in subsets:
-        try:
-            begin = start(views.take(subset), eye)
-        except np.linalg.LinAlgError:
-            continue
-        off = residuals(views, eye, *begin)
-        size = (_ARM * np.linalg.norm(off[:, :3], axis=1)) ** 2 + np.linalg.norm(off[:, 3:], axis=1) ** 2
-        value = np.sort(size)[wanted - 1]
-        if value < least:
-            best, least, errors = begin, value, size
-    return best, errors
+def _find_start(
+    views: Views, eye: Eye, wanted: int
+) -> tuple[tuple[Similarity[np.ndarray], Similarity[np.ndarray]], Float[np.ndarray, " n"]]:
+    """The closed form of four views whose errors, the ``wanted`` smallest, are smallest; and all of its errors."""
+    rng = np.random.default_rng(0)
+    subsets = np.argsort(rng.uniform(size=(_SUBSETS, len(views))), axis=1)[:, :FEWEST]
+    mounts, boards = start_many(views, eye, subsets)
+    off = residuals(views, eye, mounts, boards)
+    size = np.square(_ARM * off[..., :3]).sum(-1) + np.square(off[..., 3:]).sum(-1)
+    best = int(np.sort(size, axis=1)[:, wanted - 1].argmin())
+    return (mounts.take(best), boards.take(best)), size[best]
 
 
 def match(
@@ -119,8 +116,8 @@ def find_shift(
         there = (own + shift >= 0) & (own + shift < len(base_from_gripper.scale))
         views = Views(base_from_gripper.take(own[there] + shift), camera_from_board.take(there))
         agreed = agree(views, eye)
-        if agreed is not None and agreed.agrees.sum() > most:
-            best, most = agreed.found, int(agreed.agrees.sum())
+        if agreed is not None and len(agreed.used) > most:
+            best, most = agreed, len(agreed.used)
     return best
 
 

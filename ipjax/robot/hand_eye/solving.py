@@ -11,7 +11,7 @@ maximisation over the error of every robot pose; A. P. Dempster, N. M. Laird and
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ipjax.robot.hand_eye.records import Eye, HandEye, Noise, Views
 from ipjax.transforms import Similarity, difference, retract, vector_from_rotation
@@ -30,19 +30,29 @@ def holder_from_mount(base_from_gripper: Similarity[np.ndarray], eye: Eye) -> Si
 
 def start(views: Views, eye: Eye) -> tuple[Similarity[np.ndarray], Similarity[np.ndarray]]:
     """``mount_from_camera`` and ``holder_from_board`` in closed form (Park and Martin), all views alike."""
+    mounts, boards = start_many(views, eye, np.arange(len(views))[None])
+    return mounts.take(0), boards.take(0)
+
+
+def start_many(
+    views: Views, eye: Eye, subsets: Int[np.ndarray, "s k"]
+) -> tuple[Similarity[np.ndarray], Similarity[np.ndarray]]:
+    """The same of many subsets of the views, [s] each."""
     robot, board = holder_from_mount(views.base_from_gripper, eye), views.camera_from_board
-    first, second = np.triu_indices(len(views), 1)
+    one, other = np.triu_indices(subsets.shape[1], 1)
+    first, second = subsets[:, one], subsets[:, other]  # s × pairs
     mount = robot.take(second).inverse() @ robot.take(first)
     camera = board.take(second) @ board.take(first).inverse()
     a, b = vector_from_rotation(mount.rotation), vector_from_rotation(camera.rotation)
-    sure = (np.linalg.norm(a, axis=1) < _NEAR_HALF) & (np.linalg.norm(b, axis=1) < _NEAR_HALF)
-    rotation = _nearest_rotation(a[sure].T @ b[sure])
-    left = (mount.rotation - np.eye(3)).reshape(-1, 3)
-    right = (camera.translation @ rotation.T - mount.translation).reshape(-1)
-    translation = np.linalg.lstsq(left, right, rcond=None)[0]
-    mount_from_camera = Similarity(rotation, translation, np.ones(()))
-    every = robot @ (_spread(mount_from_camera) @ board)
-    mean = Similarity(_nearest_rotation(every.rotation.sum(0)), every.translation.mean(0), np.ones(()))
+    sure = (np.linalg.norm(a, axis=-1) < _NEAR_HALF) & (np.linalg.norm(b, axis=-1) < _NEAR_HALF)
+    rotation = _nearest_rotation(np.einsum("sp,spi,spj->sij", sure.astype(float), a, b))
+    left = mount.rotation - np.eye(3)
+    right = np.einsum("sij,spj->spi", rotation, camera.translation) - mount.translation
+    inner = np.einsum("spki,spkj->sij", left, left)
+    translation = (np.linalg.pinv(inner, hermitian=True) @ np.einsum("spki,spk->si", left, right)[..., None])[..., 0]
+    mount_from_camera = Similarity(rotation, translation, np.ones(len(subsets)))
+    every = robot.take(subsets) @ _spread(mount_from_camera) @ board.take(subsets)
+    mean = Similarity(_nearest_rotation(every.rotation.sum(1)), every.translation.mean(1), np.ones(len(subsets)))
     return mount_from_camera, mean
 
 
@@ -133,16 +143,23 @@ def _spread(pose: Similarity[np.ndarray]) -> Similarity[np.ndarray]:
     return Similarity(pose.rotation[..., None, :, :], pose.translation[..., None, :], ones)
 
 
-def _nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+def _copies(pose: Similarity[np.ndarray], count: int) -> Similarity[np.ndarray]:
+    parts = pose.rotation, pose.translation, pose.scale
+    return Similarity(*(np.broadcast_to(part, (count, *part.shape)) for part in parts))
+
+
+def _nearest_rotation(matrix: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 3"]:
     """The rotation R with the largest trace of Rᵀ matrix."""
     left, _, right = np.linalg.svd(matrix)
-    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    left[..., 2] *= np.linalg.det(left @ right)[..., None]
+    return left @ right
 
 
 def _linearise(views: Views, eye: Eye, mount: Similarity[np.ndarray], board: Similarity[np.ndarray]):
     """Residuals [n, 6] and their derivatives [n, 6, 12] by the steps of the mount and of the board."""
     steps = _STEP * np.concatenate([np.zeros((1, 12)), np.eye(12), -np.eye(12)])
-    moved = residuals(views, eye, retract(mount, steps[:, :6]), retract(board, steps[:, 6:]))
+    mounts, boards = (_copies(pose, len(steps)) for pose in (mount, board))
+    moved = residuals(views, eye, retract(mounts, steps[:, :6]), retract(boards, steps[:, 6:]))
     return moved[0], np.moveaxis(moved[1:13] - moved[13:], 0, -1) / (2 * _STEP)
 
 
