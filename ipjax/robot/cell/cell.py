@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ipjax.capture.records import CaptureError
-from ipjax.capture.views.settling import SettlingConfig, settle
 from ipjax.files.meshes.mesh import Mesh, diameter, move
 from ipjax.robot.cell.arms import FINGERS, GRIP, Arm, make_arm
 from ipjax.robot.cell.parts import Parts, make_parts
@@ -17,7 +15,7 @@ from ipjax.robot.cell.physics import PhysicsConfig, describe_contact, load_mujoc
 from ipjax.robot.grippers import FRANKA_HAND
 from ipjax.robot.records import Gripper
 from ipjax.synthetic.objects import KINDS
-from ipjax.synthetic.tables import make_clutter
+from ipjax.synthetic.tables import make_clutter, place_on_table
 from ipjax.transforms import Similarity
 
 log = logging.getLogger("ipjax")
@@ -25,6 +23,8 @@ log = logging.getLogger("ipjax")
 MIDDLE = (0.5, 0.0)  # of the table before the robot, base frame, metres
 DENSITY = 350.0  # kg / m³ of a thing whose mass is not known
 HEAVIEST = 2.0  # kg of one
+_TRIES = 8  # times that all is put down anew, where something rolls off or does not come to rest
+_AWAY = 0.4  # metres from the table's middle, beyond which a thing rolled off
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +65,13 @@ class Cell:
         mujoco.mj_forward(self.model, data)
         return data
 
+    def state_at(self, joints: Float[np.ndarray, " j"]) -> Any:
+        """The same with the arm at other joints: as it looks there, without having moved."""
+        data = self.state()
+        data.qpos[self.arm_places] = joints
+        load_mujoco().mj_forward(self.model, data)
+        return data
+
     def hold(self, joints: Float[np.ndarray, " j"], opening: float | None = None) -> Float[np.ndarray, " u"]:
         """Inputs of the actuators that hold the arm at joint positions, with the fingers so far from closed (m)."""
         control = np.zeros(self.model.nu)
@@ -95,10 +102,13 @@ def make_cell(
     arm: str = "auto",
     clutter: int = 0,
     base_from_object: Sequence[Similarity[np.ndarray]] | None = None,
-    spread: float = 0.12,
+    spread: float = 0.1,
     config: PhysicsConfig = PhysicsConfig(),
 ) -> Cell:
-    """A robot before a table on which the objects lie as they fell; the same seed gives the same cell.
+    """A robot before a table with objects at rest; the same seed gives the same cell.
+
+    Each is put on a face of its hull, the larger the likelier, as in `ipjax.make_scene`, and let go: what does not stand
+    falls over.
 
     Args:
       meshes: in metres, or of unit diameter with `sizes`. The first is the one to pick.
@@ -109,7 +119,7 @@ def make_cell(
         Panda where the package is and the gripper is its hand.
       clutter: so many made objects lie around.
       base_from_object: rigid poses from which the objects are let go, instead of drawn ones; without clutter.
-      spread: metres from the table's middle, within which they are dropped.
+      spread: metres from the table's middle, to either side, within which the first is put.
 
     Raises:
       ValueError: no meshes; lengths that differ; a mesh that is flat, or too large or small for the table; poses
@@ -131,16 +141,20 @@ def make_cell(
         parts = make_parts(mesh, name, "auto" if i < given else "hull")
         kilograms = min(DENSITY * parts.volume, HEAVIEST) if mass is None else float(mass)
         things.append(Thing(name, mesh, parts, kilograms, f"thing{i}"))
-    if base_from_object is None:
-        poses = _drop(meshes, names, seed, spread)
-    else:
-        poses = list(base_from_object)
     robot = make_arm(arm, gripper, config)
     model = _build(robot, things, config)
+    start = None
+    for _ in range(_TRIES if base_from_object is None else 1):
+        poses = _place(rng, meshes, spread) if base_from_object is None else base_from_object
+        start = _come_to_rest(model, robot, things, poses)
+        if start is not None:
+            break
+    if start is None:
+        raise ValueError(f"{', '.join(names)}: not all of them come to rest on the table before the robot")
     notes = tuple(note for thing in things for note in thing.parts.notes)
     for note in notes:
         log.warning("%s", note)
-    return Cell(model, _come_to_rest(model, robot, things, poses), robot, tuple(things), given, config, seed, notes)
+    return Cell(model, start, robot, tuple(things), given, config, seed, notes)
 
 
 def body_pose(data: Any, name: str) -> Similarity[np.ndarray]:
@@ -164,13 +178,11 @@ def _check(given, names, sizes, masses, base_from_object, clutter) -> None:
         raise ValueError("clutter is 0 or more, and 0 where poses are given: it is dropped with the objects")
 
 
-def _drop(meshes: Sequence[Mesh], names: Sequence[str], seed: int, spread: float) -> list[Similarity[np.ndarray]]:
-    try:
-        settled = settle(meshes, seed, SettlingConfig(spread=spread))
-    except CaptureError as error:
-        raise ValueError(f"{', '.join(names)}: {error}") from None
-    base_from_table = Similarity(np.eye(3), np.array([*MIDDLE, 0.0]), np.ones(()))
-    return [base_from_table @ pose for pose in settled.world_from_thing]
+def _place(rng: np.random.Generator, meshes: Sequence[Mesh], spread: float) -> list[Similarity[np.ndarray]]:
+    """Where they are let go, a little above the table."""
+    shift = np.array([*(np.array(MIDDLE) + rng.uniform(-spread, spread, 2)), 0.001])
+    base_from_table = Similarity(np.eye(3), shift, np.ones(()))
+    return [base_from_table @ pose for pose in place_on_table(rng, meshes, [1.0] * len(meshes), gap=0.01)]
 
 
 def _build(robot: Arm, things: Sequence[Thing], config: PhysicsConfig) -> Any:
@@ -200,8 +212,8 @@ def _build(robot: Arm, things: Sequence[Thing], config: PhysicsConfig) -> Any:
 
 def _come_to_rest(
     model: Any, robot: Arm, things: Sequence[Thing], poses: Sequence[Similarity[np.ndarray]]
-) -> Float[np.ndarray, " q"]:
-    """Where all comes to rest with its true parts: where it was dropped, it was its hull."""
+) -> Float[np.ndarray, " q"] | None:
+    """Generalised positions once all that was let go is at rest; None where it is not, or rolled away."""
     mujoco = load_mujoco()
     data = mujoco.MjData(model)
     for name, value in zip(robot.joints, robot.home, strict=True):
@@ -225,6 +237,9 @@ def _come_to_rest(
         still = still + model.opt.timestep if moving < 0.02 else 0.0
         if still > 0.1:
             break
+    places = np.stack([data.body(thing.body).xpos[:2] for thing in things])
+    if still <= 0.1 or np.linalg.norm(places - MIDDLE, axis=1).max() > _AWAY:
+        return None
     rest = home.copy()
     for joint in free:
         rest[joint.qposadr[0] : joint.qposadr[0] + 7] = data.qpos[joint.qposadr[0] : joint.qposadr[0] + 7]

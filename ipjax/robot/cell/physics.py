@@ -19,6 +19,7 @@ class PhysicsConfig:
     step: float = 0.002  # seconds
     elliptic: bool = True  # MuJoCo's cone of friction; the pyramidal one lets things creep
     impratio: float = 10.0  # stiffness of friction against that of contacts
+    noslip: int = 5  # iterations that undo what soft contacts let creep below the limit of friction
     friction: float = 0.7  # between a thing and all it touches
     torsion: float = 0.004  # metres: friction against turning about a contact's normal
     rolling: float = 0.0005  # metres: friction against rolling
@@ -50,6 +51,7 @@ def set_options(spec: Any, config: PhysicsConfig) -> None:
     cones = mujoco.mjtCone
     spec.option.cone = cones.mjCONE_ELLIPTIC if config.elliptic else cones.mjCONE_PYRAMIDAL
     spec.option.impratio = config.impratio
+    spec.option.noslip_iterations = config.noslip
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 

@@ -1,0 +1,1 @@
+"""A pick as a film and as a page."""
