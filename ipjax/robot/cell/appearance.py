@@ -41,11 +41,13 @@ def list_shown(cell: Cell) -> list[tuple[Mesh, int]]:
 
 def surroundings(cell: Cell) -> list[Mesh]:
     """Table and room, base frame; their colours follow from the cell's seed."""
-    return [move(mesh, np.eye(3), np.array([*MIDDLE, 0.0])) for mesh in make_room(np.random.default_rng([cell.seed, 97]))]
+    return [
+        move(mesh, np.eye(3), np.array([*MIDDLE, 0.0])) for mesh in make_room(np.random.default_rng([cell.seed, 97]))
+    ]
 
 
 def _geom_mesh(model: Any, geom: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices in the body's frame, faces, and colours [n 3] of one geom; its corners are its own, so edges are sharp."""
+    """Vertices in the body's frame, faces, and colours [n 3] of one geom."""
     mujoco = load_mujoco()
     kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_MESH:

@@ -44,7 +44,7 @@ def make_arm(kind: str, gripper: Gripper, config: PhysicsConfig) -> Arm:
     if kind not in ARMS:
         raise ValueError(f"unknown arm {kind!r}: one of {', '.join(ARMS)}")
     if kind == "panda" and gripper.name != "franka":
-        raise ValueError(f"the Panda's model has the Franka hand, not {gripper.name}; with another take the arm 'gantry'")
+        raise ValueError(f"the Panda's model has the Franka hand, not {gripper.name}; with another take 'gantry'")
     if kind == "panda" or (kind == "auto" and gripper.name == "franka" and has_panda()):
         return _make_panda(gripper, config)
     return _make_gantry(gripper, config)
@@ -57,7 +57,7 @@ def _make_panda(gripper: Gripper, config: PhysicsConfig) -> Arm:
     for light in list(spec.lights):
         spec.delete(light)
     grip = spec.actuator(GRIP)
-    force = 2 * finger_force(config, gripper.force)  # the tendon gives half to either finger
+    force = 2 * finger_force(gripper.force, config)  # the tendon gives half to either finger
     grip.gainprm = [_STIFFNESS, *[0.0] * 9]
     grip.biasprm = [0.0, -_STIFFNESS, -_DAMPING, *[0.0] * 7]
     grip.forcerange = [-force, force]
@@ -72,14 +72,14 @@ def _make_panda(gripper: Gripper, config: PhysicsConfig) -> Arm:
 
 def _make_gantry(gripper: Gripper, config: PhysicsConfig) -> Arm:
     """Three slides and three hinges that carry a gripper of boxes, measured as the gripper says."""
-    force = 2 * finger_force(config, gripper.force)
+    force = 2 * finger_force(gripper.force, config)
     half = float(gripper.opening) / 2
     along, across = (0, 1) if gripper.closing == "x" else (1, 0)
     pad_length, breadth = (float(x) for x in gripper.pad)
     length, thickness = (float(x) for x in gripper.finger)
     tip = float(gripper.tip)
 
-    def put(along_value: float, across_value: float, z: float) -> str:
+    def put(along_value: float | int, across_value: float | int, z: float | int) -> str:
         values = [0.0, 0.0, z]
         values[along], values[across] = along_value, across_value
         return " ".join(f"{value:.6g}" for value in values)
@@ -114,9 +114,12 @@ def _make_gantry(gripper: Gripper, config: PhysicsConfig) -> Arm:
       <worldbody><body name="gantry">{opened}
         <body name="{HAND}" quat="0 1 0 0" gravcomp="1">{boxes}{fingers}</body>
       {"</body>" * 6}</body></worldbody>
-      <tendon><fixed name="split"><joint joint="{FINGERS[0]}" coef="0.5"/><joint joint="{FINGERS[1]}" coef="0.5"/></fixed>
+      <tendon>
+        <fixed name="split"><joint joint="{FINGERS[0]}" coef="0.5"/><joint joint="{FINGERS[1]}" coef="0.5"/></fixed>
       </tendon>
-      <equality><joint joint1="{FINGERS[0]}" joint2="{FINGERS[1]}" solimp="0.95 0.99 0.001" solref="0.005 1"/></equality>
+      <equality>
+        <joint joint1="{FINGERS[0]}" joint2="{FINGERS[1]}" solimp="0.95 0.99 0.001" solref="0.005 1"/>
+      </equality>
       <actuator>{servos}
         <general name="{GRIP}" tendon="split" forcerange="{-force} {force}" ctrlrange="{-BITE} {half:.6g}"
           biastype="affine" gainprm="{_STIFFNESS}" biasprm="0 {-_STIFFNESS} {-_DAMPING}"/>

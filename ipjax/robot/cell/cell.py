@@ -72,7 +72,7 @@ class Cell:
         load_mujoco().mj_forward(self.model, data)
         return data
 
-    def hold(self, joints: Float[np.ndarray, " j"], opening: float | None = None) -> Float[np.ndarray, " u"]:
+    def hold(self, joints: Float[np.ndarray, " j"], opening: float | int | None = None) -> Float[np.ndarray, " u"]:
         """Inputs of the actuators that hold the arm at joint positions, with the fingers so far from closed (m)."""
         control = np.zeros(self.model.nu)
         control[: len(joints)] = joints
@@ -107,8 +107,8 @@ def make_cell(
 ) -> Cell:
     """A robot before a table with objects at rest; the same seed gives the same cell.
 
-    Each is put on a face of its hull, the larger the likelier, as in `ipjax.make_scene`, and let go: what does not stand
-    falls over.
+    Each is put on a face of its hull, the larger the likelier, as in `ipjax.make_scene`, and let go: what does not
+    stand falls over.
 
     Args:
       meshes: in metres, or of unit diameter with `sizes`. The first is the one to pick.

@@ -1,4 +1,4 @@
-"""Where the arm can go: joints for a pose of the hand, by damped least squares on MuJoCo's Jacobians, and the way there.
+"""Where the arm can go: joints for a pose of the hand, by damped least squares on MuJoCo's Jacobians; and the way.
 
 Equations: Buss, "Introduction to inverse kinematics with Jacobian transpose, pseudoinverse and damped least squares
 methods", 2004; joints that the pose leaves free are drawn towards where the arm was.
@@ -39,12 +39,12 @@ class Reach:
     possible: bool
     why: str  # why not, in words; "" where it is possible
     base_from_gripper: Similarity[np.ndarray]  # or the same turned by half about the approach: the fingers are alike
-    arrival: Float[np.ndarray, "k j"]  # joints from home to the place behind the grasp; [0 j] where not possible
+    arrival: Float[np.ndarray, "ka j"]  # joints from home to the place behind the grasp; [0 j] where not possible
     approach: Float[np.ndarray, "k j"]  # straight to the grasp
-    lift: Float[np.ndarray, "k j"]  # straight up
+    lift: Float[np.ndarray, "kl j"]  # straight up
 
 
-def reach(cell: Cell, base_from_gripper: Similarity, config: MotionConfig = MotionConfig()) -> Reach:
+def reach(cell: Cell, base_from_gripper: Similarity[Any], config: MotionConfig = MotionConfig()) -> Reach:
     """Joints for the way of a pick at one pose of the hand, rigid.
 
     Raises:

@@ -8,6 +8,7 @@ import dataclasses
 import hashlib
 import logging
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -115,8 +116,9 @@ def _cached_parts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
             log.info("%s cannot be read, and is made again", path)
     corners = tuple(_decompose(vertices, faces))
     try:
-        with writing(path, parents=True) as temporary, open(temporary, "wb") as file:
-            np.savez(file, **{f"part{i:03d}": part for i, part in enumerate(corners)})
+        named: dict[str, Any] = {f"part{i:03d}": part for i, part in enumerate(corners)}
+        with writing(path, parents=True) as temporary:
+            np.savez(temporary, **named)
     except OSError as error:
         log.info("convex parts are not kept: %s", error)
     return corners

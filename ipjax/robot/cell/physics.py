@@ -11,7 +11,6 @@ import sys
 from typing import Any
 
 
-
 @dataclasses.dataclass(frozen=True)
 class PhysicsConfig:
     """Settings of the simulation; sources: MuJoCo's documentation, "Preventing slip", and Franka's data sheet."""
@@ -66,6 +65,6 @@ def describe_contact(config: PhysicsConfig) -> dict[str, Any]:
     }
 
 
-def finger_force(config: PhysicsConfig, gripper_force: Any) -> float:
+def finger_force(gripper_force: Any, config: PhysicsConfig) -> float:
     """Newtons with which each finger presses."""
     return min(float(gripper_force), 70.0) if config.force is None else config.force

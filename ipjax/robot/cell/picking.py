@@ -6,11 +6,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ipjax.robot.cell.arms import BITE, FINGER_BODIES, FINGERS, HAND
+from ipjax.robot.cell.arms import BITE, FINGER_BODIES, FINGERS, GRIP, HAND
 from ipjax.robot.cell.cell import Cell, body_pose
 from ipjax.robot.cell.motion import MotionConfig, Reach, reach
 from ipjax.robot.cell.physics import load_mujoco
 from ipjax.transforms import Similarity, vector_from_rotation
+
+_WATCH = 10  # steps after which it is looked how far the thing has slipped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +27,7 @@ class PickConfig:
     hold: float = 1.0  # seconds
     risen: float = 0.10  # metres that the thing must have risen at the end
     slip: float = 0.02  # metres that it may move in the hand
-    frames: float = 20.0  # a second that are recorded; 0 = none
+    frames: float | int = 20  # a second that are recorded; 0 = none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Pick:
 
 def pick(
     cell: Cell,
-    base_from_gripper: Similarity,
+    base_from_gripper: Similarity[Any],
     *,
     target: int = 0,
     most: int = 20,
@@ -104,7 +106,7 @@ def pick(
     """
     poses = base_from_gripper.to_numpy()
     if poses.translation.ndim != 2:
-        raise ValueError(f"base_from_gripper has one leading axis, of grasps; its translation is {poses.translation.shape}")
+        raise ValueError(f"base_from_gripper has one leading axis, of grasps; it has {poses.translation.ndim - 1}")
     if not 0 <= target < len(cell.things):
         raise ValueError(f"there is no thing {target}: the cell has {len(cell.things)}")
     refused = []
@@ -130,6 +132,7 @@ class _Run:
         self.finger_places = [cell.model.joint(name).qposadr[0] for name in FINGERS]
         self.half = float(cell.gripper.opening) / 2
         self.grip = self.half  # metres from closed, as told
+        self.servo = cell.model.actuator(GRIP).id
         self.stage, self.watched = "", False
         self.touched, self.slip = False, 0.0
         self.hand_from_thing: Similarity[np.ndarray] | None = None  # at the lift
@@ -190,37 +193,38 @@ class _Run:
 
     def move(self, way: np.ndarray, seconds: float) -> None:
         """Along joint positions, from rest to rest."""
-        share = np.linspace(0, 1, len(way))
         steps = max(int(seconds * 1.5 / self.model.opt.timestep), 1)
-        for step in range(steps):
-            t = (step + 1) / steps
-            smooth = t * t * (3 - 2 * t)
-            joints = np.array([np.interp(smooth, share, column) for column in way.T])
-            self.advance(joints)
+        t = np.arange(1, steps + 1) / steps
+        smooth, share = t * t * (3 - 2 * t), np.linspace(0, 1, len(way))
+        joints = np.stack([np.interp(smooth, share, column) for column in way.T], axis=-1)
         self.joints = way[-1]
+        self.advance(joints, np.full(steps, self.grip))
 
     def wait(self, seconds: float) -> None:
-        for _ in range(int(seconds / self.model.opt.timestep)):
-            self.advance(self.joints)
+        steps = int(seconds / self.model.opt.timestep)
+        self.advance(np.repeat(self.joints[None], steps, 0), np.full(steps, self.grip))
 
     def close(self, to: float, seconds: float) -> None:
-        begin, steps = self.grip, int(seconds / self.model.opt.timestep)
-        for step in range(steps):
-            self.grip = begin + (to - begin) * (step + 1) / steps
-            self.advance(self.joints)
+        steps = int(seconds / self.model.opt.timestep)
+        grips = np.linspace(self.grip, to, steps + 1)[1:]
+        self.grip = to
+        self.advance(np.repeat(self.joints[None], steps, 0), grips)
 
-    def advance(self, joints: np.ndarray) -> None:
-        """One step of the simulation."""
-        self.data.ctrl[:] = self.cell.hold(joints, self.grip)
-        self.mujoco.mj_step(self.model, self.data)
-        if self.watched and not self.touched:
-            self.touched = any(self.body in pair for pair in self.pairs())
-        if self.hand_from_thing is not None:
-            now = body_pose(self.data, HAND).inverse() @ body_pose(self.data, self.thing)
-            self.slip = max(self.slip, float(np.linalg.norm(now.translation - self.hand_from_thing.translation)))
-        rate = self.config.frames
-        if rate and self.data.time >= len(self.frames) / rate:
-            self.frames.append((self.data.time, self.stage, self.data.xmat.copy(), self.data.xpos.copy()))
+    def advance(self, joints: np.ndarray, grips: np.ndarray) -> None:
+        """The simulation with these inputs, one of each for a step."""
+        data, rate = self.data, self.config.frames
+        for number in range(len(grips)):
+            data.ctrl[: joints.shape[1]] = joints[number]
+            data.ctrl[self.servo] = grips[number]
+            self.mujoco.mj_step(self.model, data)
+            if self.watched and not self.touched:
+                self.touched = any(self.body in pair for pair in self.pairs())
+            if self.hand_from_thing is not None and number % _WATCH == 0:
+                now = body_pose(data, HAND).inverse() @ body_pose(data, self.thing)
+                away = np.linalg.norm(now.translation - self.hand_from_thing.translation)
+                self.slip = max(self.slip, float(away))
+            if rate and data.time >= len(self.frames) / rate:
+                self.frames.append((data.time, self.stage, data.xmat.copy(), data.xpos.copy()))
 
     def pairs(self) -> list[tuple[int, int]]:
         """Bodies in contact."""
@@ -254,17 +258,13 @@ class _Run:
 
 def judge(told: Pick, config: PickConfig) -> tuple[bool, str]:
     """Whether it was a success, and a sentence on it."""
-    landed = (
-        f"the hand touched it on the way and pushed it by {1e3 * told.pushed:.0f} mm"
-        if told.touched and told.pushed > 0.002
-        else ""
-    )
     if told.risen >= config.risen and told.slip <= config.slip:
         return True, f"lifted by {1e3 * told.risen:.0f} mm and held, with {1e3 * told.slip:.1f} mm of slip"
     if told.risen >= config.risen:
         why = f"it slipped by {1e3 * told.slip:.0f} mm in the hand"
     elif not told.reached:
-        why = "the hand did not come to the grasp: something was in the way"
+        cause = "it landed on the thing" if told.touched else "something was in the way"
+        why = f"the hand did not come to the grasp: {cause}"
     elif told.fingers == 0:
         why = "the fingers closed on nothing"
     elif told.fingers == 1:
@@ -273,4 +273,6 @@ def judge(told: Pick, config: PickConfig) -> tuple[bool, str]:
         why = f"it slipped out of the fingers, which pressed with {told.force:.0f} N"
     else:
         why = f"it rose by {1e3 * told.risen:.0f} mm only"
-    return False, why + (f"; {landed}" if landed else "")
+    if told.touched and told.pushed > 0.002:
+        why += f"; the hand had touched it on the way and pushed it by {1e3 * told.pushed:.0f} mm"
+    return False, why

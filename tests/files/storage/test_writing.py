@@ -104,6 +104,7 @@ MAY = {  # by package, and why
     ("ipjax/rendering", "np.savez"): "the child's job, in a folder of its own",
     ("ipjax/rendering", "write_text"): "the child's job, in a folder of its own",
     ("ipjax/rendering", "open"): "what the child says, in a folder of its own",
+    ("ipjax/robot", "save"): "an animation, into memory",
     ("ipjax/bop", "open"): "a journal, a line at a time",
 }
 

@@ -1,5 +1,6 @@
 """A film of a pick: its recording, drawn by the renderer that draws all else, and written as MP4 or GIF."""
 
+import io
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from ipjax.cameras import middle
 from ipjax.capture.views.paths import look_from
-from ipjax.files.storage.writing import writing
+from ipjax.files.storage.writing import write_bytes, writing
 from ipjax.inference.cards import find_font
 from ipjax.records import Camera
 from ipjax.rendering.render import render_frames
@@ -53,7 +54,9 @@ def draw_film(
     """
     width, height = size
     place = np.array([MIDDLE[0] + 0.72, MIDDLE[1] - 0.92, 0.62])
-    base_from_camera = look_from(place[None], np.array([MIDDLE[0] - 0.14, MIDDLE[1], 0.26]), np.array([0.0, 0, 1])).take(0)
+    base_from_camera = look_from(
+        place[None], np.array([MIDDLE[0] - 0.14, MIDDLE[1], 0.26]), np.array([0.0, 0, 1])
+    ).take(0)
     camera = Camera.from_matrix(np.array([[0.95 * width, 0, 0], [0, 0.95 * width, 0], [0, 0, 1.0]]))
     camera = Camera(camera.focal, camera.centre + middle(width, height).astype(np.float32))
     camera_from_base = base_from_camera.inverse()
@@ -77,11 +80,14 @@ def draw_film(
     )
     times, stages = recording.times[::every], recording.stages[::every]
     return np.stack(
-        [_label(image, WORDS.get(stage, stage), time) for image, stage, time in zip(drawn.rgb, stages, times, strict=True)]
+        [
+            _label(image, WORDS.get(stage, stage), time)
+            for image, stage, time in zip(drawn.rgb, stages, times, strict=True)
+        ]
     )
 
 
-def write_film(path: str | Path, frames: UInt8[np.ndarray, "f h w 3"], rate: float) -> Path:
+def write_film(path: str | Path, frames: UInt8[np.ndarray, "f h w 3"], rate: float | int) -> Path:
     """Write a film: MP4 (MPEG-4), or where no encoder for it works a GIF of half the size beside it.
 
     Args:
@@ -100,27 +106,25 @@ def write_film(path: str | Path, frames: UInt8[np.ndarray, "f h w 3"], rate: flo
         raise ValueError(f"{path}: a film's name ends in .mp4 or .gif")
     if path.suffix == ".mp4":
         with writing(path) as temporary:
-            if _encode(temporary, frames, rate):
-                return path
-            temporary.write_bytes(b"")
-        path.unlink(missing_ok=True)
+            encoded = _encode(temporary, frames, rate)
+        if encoded:
+            return path
+        path.unlink()  # empty
         path = path.with_suffix(".gif")
         log.warning("OpenCV has no encoder for MP4 here: the film is %s", path.name)
-    with writing(path) as temporary:
-        animate(temporary, frames[:, ::2, ::2], rate)
-    return path
+    return write_bytes(path, animate(frames[:, ::2, ::2], rate, "GIF"))
 
 
-def animate(target, frames: UInt8[np.ndarray, "f h w 3"], rate: float, kind: str | None = None) -> None:
-    """Write frames as an animated image that plays for ever, to a path or a stream; ``kind`` as Pillow calls it."""
+def animate(frames: UInt8[np.ndarray, "f h w 3"], rate: float | int, kind: str) -> bytes:
+    """Frames as an animated image that plays for ever; ``kind`` is "GIF" or "WEBP", which pages embed."""
     images = [Image.fromarray(np.ascontiguousarray(frame)) for frame in frames]
     more = {"quality": 70, "method": 2} if kind == "WEBP" else {}
-    images[0].save(
-        target, kind, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0, **more
-    )
+    memory = io.BytesIO()
+    images[0].save(memory, kind, save_all=True, append_images=images[1:], duration=round(1000 / rate), loop=0, **more)
+    return memory.getvalue()
 
 
-def _encode(path: Path, frames: np.ndarray, rate: float) -> bool:
+def _encode(path: Path, frames: np.ndarray, rate: float | int) -> bool:
     """Whether OpenCV could write the film."""
     height, width = frames.shape[1:3]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), float(rate), (width, height))
