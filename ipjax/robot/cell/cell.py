@@ -23,6 +23,7 @@ log = logging.getLogger("ipjax")
 MIDDLE = (0.5, 0.0)  # of the table before the robot, base frame, metres
 DENSITY = 350.0  # kg / m³ of a thing whose mass is not known
 HEAVIEST = 2.0  # kg of one
+_SMALLEST, _LARGEST = 0.015, 0.6  # metres: diameters of what is taken for an object
 _TRIES = 8  # times that all is put down anew, where something rolls off or does not come to rest
 _AWAY = 0.4  # metres from the table's middle, beyond which a thing rolled off
 
@@ -131,6 +132,9 @@ def make_cell(
     _check(given, names, sizes, masses, base_from_object, clutter)
     if sizes is not None:
         meshes = [move(m, np.eye(3), scale=size / diameter(m)) for m, size in zip(meshes, sizes, strict=True)]
+    for mesh, name in zip(meshes, names, strict=True):
+        if not _SMALLEST < (size := diameter(mesh)) < _LARGEST:
+            raise ValueError(f"{name} is {1e3 * size:.3g} mm large, which no hand here picks; is its unit right?")
     rng = np.random.default_rng([seed, 83])
     for number in rng.choice(10 * len(KINDS), clutter, replace=False):
         meshes.append(move(make_clutter(int(number)), np.eye(3), scale=float(rng.uniform(0.06, 0.13))))

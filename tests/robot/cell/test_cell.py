@@ -122,7 +122,9 @@ def test_what_is_no_cell_is_refused():
         ("unknown arm", ([block], 2)),
         ("not robotiq", ([block], 3)),
         ("clutter is 0", ([block], 4)),
-        ("do not|not all of them", ([make_block((0.4, 1.3, 0.4))], 5)),
+        ("not all of them", ([block], 5)),
+        ("is its unit right", ([make_block((160.0, 50.0, 50.0))],)),
+        ("is its unit right", ([make_block((0.00016, 0.00005, 0.00005))],)),
     ):
         options = [
             {"sizes": [0.1, 0.2]},
