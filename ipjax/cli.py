@@ -14,7 +14,19 @@ import warnings
 from collections.abc import Sequence
 
 from ipjax import __version__
-from ipjax.commands import capture, degrade, demo, doctor, estimate, evaluate, export, onboard, score, weights
+from ipjax.commands import (
+    calibrate,
+    capture,
+    degrade,
+    demo,
+    doctor,
+    estimate,
+    evaluate,
+    export,
+    onboard,
+    score,
+    weights,
+)
 from ipjax.commands.interface import completion
 from ipjax.commands.interface.messages import Messages, in_one_line, is_user_error
 from ipjax.commands.interface.parser import Parser
@@ -28,6 +40,7 @@ _COMMANDS = (
     score,
     evaluate,
     capture,
+    calibrate,
     degrade,
     export,
 )  # as --help lists them

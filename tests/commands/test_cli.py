@@ -27,6 +27,7 @@ COMMANDS = (
     "score",
     "evaluate",
     "capture",
+    "calibrate",
     "degrade",
     "export",
 )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Int
 
+from ipjax.files.wording import abbreviate
 from ipjax.robot.hand_eye.motion import FEWEST, check_motion
 from ipjax.robot.hand_eye.pairing import agree, find_shift, match, tell_shift
 from ipjax.robot.hand_eye.records import EYES, Eye, HandEye, HandEyeError, Views
@@ -69,11 +70,15 @@ def calibrate(
             if said is not None:
                 raise HandEyeError(said)
     if not paired.all():
-        raise HandEyeError(
-            f"there are {count} images and {poses} poses without names, and no order in which they fit: give poses by "
-            "the images' names"
-        )
-    if agreed is None or len(agreed.used) < max(FEWEST, _SHARE * count):
+        if agreed is None or not agreed.counted.all():
+            raise HandEyeError(
+                f"there are {count} images and {poses} poses without names, and no order in which they fit: give "
+                "poses by the images' names"
+            )
+        notes.append(f"{abbreviate([n for n, known in zip(names, paired, strict=True) if not known])}: no robot pose")
+        names, own = tuple(n for n, known in zip(names, paired, strict=True) if known), own[paired]
+        camera_from_board, covariance = views.camera_from_board, None if covariance is None else covariance[paired]
+    if agreed is None or len(agreed.used) < max(FEWEST, _SHARE * len(views)):
         raise HandEyeError(_tell_misfit(views, eye, 0 if agreed is None else len(agreed.used)))
     views = dataclasses.replace(views, covariance=covariance)
     begin = agreed.mount_from_camera, agreed.holder_from_board

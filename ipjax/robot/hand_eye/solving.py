@@ -56,6 +56,17 @@ def start_many(
     return mount_from_camera, mean
 
 
+def tell_boards(
+    base_from_gripper: Similarity[np.ndarray],
+    eye: Eye,
+    mount_from_camera: Similarity[np.ndarray],
+    holder_from_board: Similarity[np.ndarray],
+) -> Similarity[np.ndarray]:
+    """``camera_from_board`` of each robot pose, by a calibration or by many [*b]; [*b, n]."""
+    turned = holder_from_mount(base_from_gripper, eye)
+    return _spread(mount_from_camera).inverse() @ turned.inverse() @ _spread(holder_from_board)
+
+
 def residuals(
     views: Views,
     eye: Eye,
@@ -74,8 +85,7 @@ def residuals(
     robot = views.base_from_gripper
     if error is not None:
         robot = robot @ Similarity[np.ndarray].exp(error[..., None, :])
-    turned = holder_from_mount(robot, eye)
-    told = _spread(mount_from_camera).inverse() @ turned.inverse() @ _spread(holder_from_board)
+    told = tell_boards(robot, eye, mount_from_camera, holder_from_board)
     seen = views.camera_from_board
     if stretch is not None:
         seen = Similarity(seen.rotation, seen.translation * np.exp(stretch)[..., None, None], seen.scale)

@@ -11,7 +11,7 @@ import numpy as np
 from ipjax.files.rigid import FARTHEST, UNITS, to_rigid
 from ipjax.files.storage.parsing import parse, read_text
 from ipjax.files.wording import abbreviate
-from ipjax.robot.hand_eye.pose_forms import Form, RawPose, read_pose, to_rotation
+from ipjax.robot.hand_eye.reading.pose_forms import Form, RawPose, read_pose, to_rotation
 from ipjax.robot.hand_eye.records import HandEyeError
 from ipjax.transforms import Similarity
 
@@ -117,7 +117,7 @@ def pair(images: Sequence[Path], poses: RobotPoses) -> tuple[np.ndarray, np.ndar
     notes = [f"{path.stem}: there is no pose of this name" for path, n in zip(images, found, strict=True) if n < 0]
     unused = [name for number, name in enumerate(poses.names) if number not in found]
     if unused:
-        notes.append(f"{len(unused)} poses have no image: {abbreviate(unused, 6)}")
+        notes.append(f"no image of the pose of {abbreviate(unused, 6)}")
     used = np.flatnonzero(numbers >= 0)
     return used, numbers[used], notes
 
@@ -211,7 +211,7 @@ def _find_unit(positions: np.ndarray, unit: str | None) -> tuple[float, list[str
         unit = "m" if far <= _NEAREST else "mm"
         return UNITS[unit], [f"robot positions are taken for millimetres (up to {far:.0f})"] if unit == "mm" else []
     if UNITS[unit] * far > FARTHEST:
-        raise ValueError(f"a hand {UNITS[unit] * far:.3g} m from its base: the positions are not in {unit}")
+        raise ValueError(f"a hand {UNITS[unit] * far:.0f} m from its base: the positions are not in {unit}")
     return UNITS[unit], []
 
 

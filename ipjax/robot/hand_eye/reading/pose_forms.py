@@ -113,9 +113,11 @@ def _read_mapping(items: Mapping[str, Any], form: Form) -> RawPose:
         place = next((items[name] for name in _POSITION if name in items), None)
         turn = next((items[name] for name in _ROTATION if name in items), None)
         if isinstance(place, Mapping):
-            place = [_simplified(place).get(axis) for axis in "xyz"]
+            inside = _simplified(place)
+            place = [inside.get(axis) for axis in "xyz"]
         kind, rotation = _find_angles(_simplified(turn)) if isinstance(turn, Mapping) else (None, turn)
-        position = _as_numbers(place)
+        known = place is not None and None not in place
+        position = _as_numbers(place) if known else np.zeros(0)
     if rotation is None or position.shape != (3,):
         raise ValueError(
             f"x, y, z and a rotation are expected, or a matrix of 4 × 4, among its entries ({', '.join(items)})"
