@@ -82,13 +82,14 @@ def test_errors_have_no_bias_and_are_as_large_as_told(eye):
     for seed in range(40):
         made = make_calibration(seed, 15, eye, camera_noise=(3e-3 * axis, 1e-3 * axis))
         found = solve(views_of(made), eye)
-        steps.append(difference(found.mount_from_camera, made.mount_from_camera)[:6])
-        told.append(steps[-1] @ np.linalg.solve(found.covariance, steps[-1]))
+        step = difference(found.mount_from_camera, made.mount_from_camera)[:6]
+        told.append(step @ np.linalg.solve(found.covariance, step))
+        # Along the camera's axes, which every seed mounts in another way: a bias would lie along them.
+        steps.append((made.mount_from_camera.inverse() @ found.mount_from_camera).log()[:6])
         noise.append((found.noise.rotation, found.noise.translation))
     steps = np.array(steps)
     assert np.degrees(np.median(np.linalg.norm(steps[:, :3], axis=1))) < 0.1
     assert 1000 * np.median(np.linalg.norm(steps[:, 3:], axis=1)) < 1.5
-    assert np.abs(steps.mean(0)).max() < (4 * steps.std(0) / np.sqrt(40)).max()
     assert (np.abs(steps.mean(0)) < 4 * steps.std(0) / np.sqrt(40)).all()
     assert 4.5 < np.mean(told) < 8.5  # six, if the covariance is right
     np.testing.assert_allclose(np.mean(noise, 0), [3e-3 * axis, 1e-3 * axis], rtol=0.1)
