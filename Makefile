@@ -64,9 +64,10 @@ demo: $(READY)
 
 test: lint pytest
 
-# The tests run the notebooks too, and pytest's closing line stays the last one.
+# The tests run the notebooks too, and pytest's closing line stays the last one. Each process begins at its own part of the
+# files, so that few are compiled by both, and takes of another's when it is done.
 pytest: $(READY)
-	$(RUN) -m pytest -n $(WORKERS) $(PYTEST)
+	$(RUN) -m pytest -n $(WORKERS) --dist worksteal $(PYTEST)
 
 lint: $(READY)
 	$(BIN)/ruff check .
