@@ -45,7 +45,6 @@ def look(query, shift=0.0) -> Cloud:
 
 # All depth is beyond the reach of losses this narrow, so that only pairs are left to fit: a cost without steps.
 OF_PAIRS = RefineConfig(width=1e-12, forgiveness=1e-6, reach=1e-12, pair_width=0.3)
-run_settle = jax.jit(lambda *given: settle(*given, OF_PAIRS))
 
 
 def test_the_minimum_moves_as_differences_say(x64):
@@ -63,25 +62,29 @@ def test_the_minimum_moves_as_differences_say(x64):
     directions = eqx.tree_at(lambda p: p.weight, directions, 10 * directions.weight)
     kinds = [lambda p: p.object, lambda p: p.camera, lambda p: p.weight]
 
-    def found(amounts, start, times=1):
+    @jax.jit
+    def once(amounts, start):
         moved = pairs
         for amount, kind in zip(amounts, kinds, strict=True):
             moved = eqx.tree_at(kind, moved, kind(moved) + amount * kind(directions))
+        return settle(surface, cloud, start, moved, OF_PAIRS)
+
+    def found(amounts, start, times):
         for _ in range(times):
-            start = run_settle(surface, cloud, start, moved)
+            start = once(amounts, start)
         return start
 
     zero = jnp.zeros(3)
     best = found(zero, retract(truth, jnp.asarray(rng.normal(size=7) * 0.02)), times=30)
-    assert float(jnp.max(jnp.abs(difference(best, found(zero, best))))) < 5e-5  # it is a minimum
-    near = lambda amounts: difference(best, found(amounts, best))
-    forward = np.asarray(jax.jacfwd(near)(zero))
+    assert float(jnp.max(jnp.abs(difference(best, once(zero, best))))) < 5e-5  # it is a minimum
+    near = lambda amounts: difference(best, once(amounts, best))
+    forward = np.asarray(jax.jit(jax.jacfwd(near))(zero))
     told = lambda amounts: difference(best, found(amounts, best, times=8))
     step = 5e-3
     differences = np.stack([(told(step * one) - told(-step * one)) / (2 * step) for one in np.eye(3)], axis=1)
     assert np.abs(forward).max(axis=0).min() > 1e-3  # each of them moves it
     assert np.all(np.abs(forward - differences) < 0.05 * np.abs(differences).max(axis=0))
-    np.testing.assert_allclose(np.asarray(jax.jacrev(near)(zero)), forward, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(jax.jit(jax.jacrev(near))(zero)), forward, atol=1e-9)
 
 
 run = jax.jit(lambda *given: refine(*given, RefineConfig(points=512)))
