@@ -23,6 +23,7 @@ from ipjax.commands import (
     estimate,
     evaluate,
     export,
+    grasp,
     onboard,
     score,
     weights,
@@ -34,6 +35,7 @@ from ipjax.commands.interface.parser import Parser
 _COMMANDS = (
     onboard,
     estimate,
+    grasp,
     demo,
     doctor,
     weights,

@@ -236,14 +236,14 @@ class GraspConfig(eqx.Module):
     spare_deviations: float = 3.0  # of the estimate along the closing axis, by which more is wanted
     tight: float = 0.2  # a score is multiplied by this where nothing is to spare
     unseen: float = 0.3  # and by 1 − this where the pads touch surface that was guessed
-    unknown: float = 0.5  # and by 1 − this where all of the hand is out of sight behind something else
+    unknown: float = 0.5  # and by 1 − this where a tenth of the hand's way is out of sight behind something else
     aslant: float = 0.3  # and by 1 − this at an approach against the wanted one
-    arm: float = 0.12  # m from the centre of the surface, sideways, at which it is multiplied by exp(−½)
+    arm: float = 0.08  # m from the centre of the surface, sideways, at which it is multiplied by exp(−½)
     tilt: float = 3.2  # rad: largest angle between the approach and straight down; above π there is no limit
     clearance: float = 0.003  # m between the hand and the table
     retreat: float = 0.1  # m: the straight way of the hand to the object, which is free
     margin: float = 0.01  # m by which the hand may lie behind measured depth: noise
-    behind: float = 0.06  # m behind measured depth up to which the hand collides: things are about as thick
+    behind: float = 0.1  # m behind measured depth up to which the hand collides: things are about as thick
     apart: tuple[float, float] = (0.01, 0.26)  # m and rad: grasps closer than both are one
 
 

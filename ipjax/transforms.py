@@ -218,27 +218,33 @@ def rotation_from_quaternion(quaternion: Float[A, "*b 4"]) -> Float[A, "*b 3 3"]
     return xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def vector_from_rotation(rotation: Float[A, "*b 3 3"]) -> Float[A, "*b 3"]:
-    """The rotation vector, of length 0 to π; it and its derivative are finite at zero. At π either sign may come.
+def quaternion_from_rotation(rotation: Float[A, "*b 3 3"]) -> Float[A, "*b 4"]:
+    """The unit quaternion x, y, z, w of a rotation, with w ≥ 0; its derivative is finite. At π either sign may come.
 
-    By the unit quaternion, of which the rotation gives all products of two parts: those with the largest part are a
-    multiple of it that is never small, so that no angle is special (S. W. Shepperd, Quaternion from Rotation Matrix,
-    Journal of Guidance and Control 1(3), 1978).
+    The rotation gives all products of two parts: those with the largest part are a multiple of the quaternion that is
+    never small, so that no angle is special (S. W. Shepperd, Quaternion from Rotation Matrix, Journal of Guidance and
+    Control 1(3), 1978).
     """
     xp = _namespace(rotation)
     (a, b, c), (d, e, f), (g, h, i) = ([rotation[..., row, column] for column in range(3)] for row in range(3))
     rows = [
-        [1 + a + e + i, h - f, c - g, d - b],
-        [h - f, 1 + a - e - i, b + d, c + g],
-        [c - g, b + d, 1 - a + e - i, f + h],
-        [d - b, c + g, f + h, 1 - a - e + i],
-    ]  # 4 q qᵀ, q = (w, x, y, z)
+        [1 + a - e - i, b + d, c + g, h - f],
+        [b + d, 1 - a + e - i, f + h, c - g],
+        [c + g, f + h, 1 - a - e + i, d - b],
+        [h - f, c - g, d - b, 1 + a + e + i],
+    ]  # 4 q qᵀ, q = (x, y, z, w)
     products = xp.stack([xp.stack(row, axis=-1) for row in rows], axis=-2)
     largest = xp.argmax(xp.stack([rows[k][k] for k in range(4)], axis=-1), axis=-1)
     chosen = xp.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
     quaternion = chosen / xp.sqrt(xp.sum(chosen * chosen, axis=-1, keepdims=True))
-    quaternion = xp.where(quaternion[..., :1] < 0, -quaternion, quaternion)
-    w, vector = quaternion[..., :1], quaternion[..., 1:]
+    return xp.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+
+
+def vector_from_rotation(rotation: Float[A, "*b 3 3"]) -> Float[A, "*b 3"]:
+    """The rotation vector, of length 0 to π; it and its derivative are finite at zero. At π either sign may come."""
+    xp = _namespace(rotation)
+    quaternion = quaternion_from_rotation(rotation)
+    vector, w = quaternion[..., :3], quaternion[..., 3:]
     squared = xp.sum(vector * vector, axis=-1, keepdims=True)
     small = squared < 1e-6
     sine = xp.sqrt(xp.where(small, xp.ones_like(squared), squared))  # of half the angle

@@ -32,6 +32,7 @@ CONVENTIONS = {
     "box_of_object": "of such an object, lowest and highest corner of the box of size_mm, object coordinates",
     "covariance": "6 x 6, of rotation vector (rad, about the object's centre) and translation (m), camera axes",
     "ambiguity": "the object's axis about which it may be turned, and by how much (standard deviation)",
+    "score": "of the pose, in [0, 1], to be compared with those of its alternatives; confidence says if it is right",
     "units": "a name ends in its unit: _m metres, _mm millimetres, _seconds seconds",
 }
 
@@ -143,8 +144,9 @@ def estimate_as_json(estimate: PoseEstimate, templates: Templates, info: ObjectI
     entry["inliers"] = int(estimate.inliers)
     entry["residual_rms_mm"] = 1e3 * float(estimate.rmse)
     entry["template"] = int(estimate.view)
-    entry["alternatives"] = []
     scores = np.asarray(estimate.hypotheses.score)
+    entry["score"] = float(scores[0])
+    entry["alternatives"] = []
     many = estimate.hypotheses.camera_from_object.to_numpy()
     for i in range(1, min(alternatives + 1, len(scores))):
         other = Similarity(many.rotation[i], many.translation[i], np.asarray(many.scale[i]))

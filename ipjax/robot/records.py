@@ -11,7 +11,7 @@ holds with ``camera_from_object`` made rigid (:func:`rigid`), as :func:`place_gr
 """
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ipjax.records import Camera, PoseEstimate
-from ipjax.transforms import Similarity
+from ipjax.transforms import A, Similarity
 
 Number = Float[Array, ""] | float
 
@@ -75,7 +75,7 @@ class Grasps(eqx.Module):
         return Grasps(object_from_gripper=poses, **{name: part[index] for name, part in parts.items()})
 
 
-def rigid(camera_from_object: Similarity) -> Similarity:
+def rigid(camera_from_object: Similarity[A]) -> Similarity[A]:
     """The pose of the metric object: the same rotation and origin, the scale divided out.
 
     What ``camera_from_object`` maps from model units ``x``, this maps from metres, ``scale * x``.
@@ -84,10 +84,10 @@ def rigid(camera_from_object: Similarity) -> Similarity:
 
 
 def place_grasps(
-    object_from_gripper: Similarity,
-    camera_from_object: Similarity | PoseEstimate,
-    base_from_camera: Similarity | None = None,
-) -> Similarity:
+    object_from_gripper: Similarity[A],
+    camera_from_object: Similarity[A] | PoseEstimate,
+    base_from_camera: Similarity[A] | None = None,
+) -> Similarity[A]:
     """``base_from_gripper = base_from_camera @ camera_from_object @ object_from_gripper``, rigid and metric.
 
     Args:
@@ -101,8 +101,10 @@ def place_grasps(
     Raises:
       ValueError: ``base_from_camera`` is a NumPy pose with a scale that is not 1.
     """
-    pose = camera_from_object.camera_from_object if isinstance(camera_from_object, PoseEstimate) else camera_from_object
-    base_from_object = rigid(pose)
+    pose: Any = camera_from_object
+    if isinstance(camera_from_object, PoseEstimate):
+        pose = camera_from_object.camera_from_object
+    base_from_object: Similarity[A] = rigid(pose)
     if base_from_camera is not None:
         if isinstance(base_from_camera.scale, np.ndarray) and np.abs(base_from_camera.scale - 1).max() > 1e-6:
             raise ValueError(f"base_from_camera is rigid: its scale is 1, not {base_from_camera.scale}")
@@ -118,5 +120,5 @@ def table_in_camera(height: Number, base_from_camera: Similarity) -> Float[Array
     return jnp.concatenate([jnp.asarray(normal), jnp.asarray(offset, normal.dtype)[None]])
 
 
-def _without_scale(pose: Similarity) -> Similarity:
+def _without_scale(pose: Similarity[A]) -> Similarity[A]:
     return Similarity(pose.rotation, pose.translation, pose.scale / pose.scale)  # ones, NumPy's or JAX's

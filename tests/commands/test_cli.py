@@ -21,6 +21,7 @@ def test_debug_shows_the_traceback(case, monkeypatch):
 COMMANDS = (
     "onboard",
     "estimate",
+    "grasp",
     "demo",
     "doctor",
     "weights",

@@ -18,16 +18,16 @@ from ipjax.transforms import Similarity, rotation_from_vector
 _CLOSING_FROM_GRIPPER = {"x": np.eye(3), "y": np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])}
 
 
-def closing_from_gripper(gripper: Gripper) -> Float[np.ndarray, "3 3"]:
-    """The rotation to the closing frame of this gripper."""
-    return _CLOSING_FROM_GRIPPER[gripper.closing]
+def closing_from_gripper(closing: str) -> Float[np.ndarray, "3 3"]:
+    """The rotation to the closing frame of a gripper whose fingers close along this axis, x or y."""
+    return _CLOSING_FROM_GRIPPER[closing]
 
 
 def make_hand(gripper: Gripper, dtype) -> Hand:
     """The hand, open, in its closing frame."""
     number = lambda x: jnp.asarray(x, dtype)
-    turn = np.abs(closing_from_gripper(gripper)).astype(dtype)
-    signed = closing_from_gripper(gripper).astype(dtype)
+    turn = np.abs(closing_from_gripper(gripper.closing)).astype(dtype)
+    signed = closing_from_gripper(gripper.closing).astype(dtype)
     rows = lambda values: jnp.stack([jnp.stack([number(x) for x in row]) for row in values])
     if gripper.boxes:
         centres = jnp.matmul(rows([c for c, _ in gripper.boxes]), signed.T, precision="highest")

@@ -22,6 +22,8 @@ from ipjax.robot.grasps.uncertainty import deviation_along, sample_poses
 from ipjax.robot.records import Workspace, rigid
 from ipjax.transforms import Similarity
 
+_HIDDEN = 0.1  # share of the hand's way that is out of sight, above which more is no worse
+
 
 class Judged(NamedTuple):
     """Hands, closed on the object at the estimated pose."""
@@ -43,7 +45,13 @@ class Surroundings(NamedTuple):
 
 
 def find_surroundings(workspace: Workspace, estimate: PoseEstimate | Similarity) -> Surroundings:
-    """The table in the object's frame, and the approach that is wanted."""
+    """The table in the object's frame, and the approach that is wanted.
+
+    Raises:
+      ValueError: there is a depth without its camera.
+    """
+    if workspace.depth is not None and workspace.camera is None:
+        raise ValueError("the depth of a workspace needs its camera")
     camera_from_object = rigid(pose_of(estimate))
     if workspace.table is None:
         return Surroundings(camera_from_object.rotation[2], None, None)
@@ -82,8 +90,7 @@ def judge(
         valid &= height > 0.99 * config.clearance
     unknown = jnp.zeros_like(width)
     if workspace.depth is not None:
-        if workspace.camera is None:
-            raise ValueError("the depth of a workspace needs its camera")
+        assert workspace.camera is not None  # `find_surroundings` has seen to it
         camera_from_object = rigid(pose_of(estimate))
         others = look_past(workspace.depth, workspace.camera, solid, camera_from_object, config)
         hits, unknown = compare_with_depth(poses, hand, others, workspace.camera, camera_from_object, config)
@@ -108,7 +115,7 @@ def judge(
         1 - config.unseen * (1 - jnp.mean(touch.seen, axis=-1)),
         jnp.exp(-jnp.sum(arm**2, axis=-1) / (2 * config.arm**2)),
         1 - config.aslant * tilt / jnp.pi,
-        1 - config.unknown * unknown,
+        1 - config.unknown * ramp(unknown / _HIDDEN),
     ]
     score = jnp.prod(jnp.stack(parts), axis=0)
     score = jnp.where(valid & jnp.isfinite(score), score, 0)

@@ -76,7 +76,9 @@ def look_past(
     rows, columns = -(-height // step), -(-width // step)
     placed = camera_from_object @ solid.points
     pixels = jnp.round(project(small, placed)).astype(jnp.int32)
-    inside = (placed[:, 2] > 1e-3) & jnp.all((pixels >= 0) & (pixels < jnp.array([columns, rows])), axis=-1)
+    inside = (placed[:, 2] > 1e-3) & jnp.all(
+        (pixels >= 0) & (pixels < jnp.asarray([columns, rows], jnp.int32)), axis=-1
+    )
     where = jnp.where(inside, pixels[:, 1] * columns + pixels[:, 0], rows * columns)
     z = placed[:, 2]
     front = jnp.full(rows * columns + 1, jnp.inf, z.dtype).at[where].min(z)[:-1].reshape(rows, columns)
@@ -120,7 +122,9 @@ def compare_with_depth(
     placed = (one @ object_from_closing) @ probes
     height, width = depth.shape
     pixels = jnp.round(project(camera, placed)).astype(jnp.int32)
-    inside = (placed[..., 2] > 1e-3) & jnp.all((pixels >= 0) & (pixels < jnp.array([width, height])), axis=-1)
+    inside = (placed[..., 2] > 1e-3) & jnp.all(
+        (pixels >= 0) & (pixels < jnp.asarray([width, height], jnp.int32)), axis=-1
+    )
     column, row = jnp.clip(pixels[..., 0], 0, width - 1), jnp.clip(pixels[..., 1], 0, height - 1)
     measured = jnp.where(inside, depth[row, column], 0)
     beyond = jnp.where(measured > 0, placed[..., 2] - measured, 0)

@@ -53,9 +53,9 @@ def plan_grasps(
     Raises:
       ValueError: the surface has fewer than 16 points, or the workspace a depth without its camera.
     """
+    around = find_surroundings(workspace, estimate)
     solid = make_solid(templates, estimate)
     hand = make_hand(gripper, solid.points.dtype)
-    around = find_surroundings(workspace, estimate)
     first, second, third = jax.random.split(key, 3)
     pairs = sample_pairs(solid, hand.opening, first, config)
     poses = fan(pairs.middle, pairs.axis, around.wanted, hand, config.approaches)
@@ -87,13 +87,13 @@ def box_grasps(
 
     Args, Returns, Raises: as :func:`plan_grasps`.
     """
+    around = find_surroundings(workspace, estimate)
     solid = make_solid(templates, estimate)
     axes = templates.axes if isinstance(templates, Templates) else jnp.eye(3, dtype=solid.points.dtype)
     spread = jnp.sum(solid.points[:, None] * axes, axis=-1)
     low, high = jnp.min(spread, axis=0), jnp.max(spread, axis=0)
     box = _box_solid(axes, low, high, solid)
     hand = make_hand(gripper, solid.points.dtype)
-    around = find_surroundings(workspace, estimate)
     poses = _box_poses(axes, low, high, hand)
     given = jnp.ones(poses.translation.shape[0], bool)
     poses, given = _above(poses, given, hand, around, config)
@@ -131,7 +131,7 @@ def _choose(
     order = jax.lax.top_k(score, min(config.grasps, score.shape[0]))[1]
     index, poses, score, safe = chosen[order], poses.take(order), score[order], safe[order]
     valid = score > 0
-    turn = jnp.asarray(closing_from_gripper(gripper), poses.rotation.dtype)
+    turn = jnp.asarray(closing_from_gripper(gripper.closing), poses.rotation.dtype)
     rotation = jnp.matmul(poses.rotation, turn, precision="highest")
     # A hand was moved along u after its points were measured.
     contacts = judged.touch.contact[index]
