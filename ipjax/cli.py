@@ -26,6 +26,7 @@ from ipjax.commands import (
     grasp,
     onboard,
     score,
+    simulate,
     weights,
 )
 from ipjax.commands.interface import completion
@@ -43,6 +44,7 @@ _COMMANDS = (
     evaluate,
     capture,
     calibrate,
+    simulate,
     degrade,
     export,
 )  # as --help lists them

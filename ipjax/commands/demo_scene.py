@@ -31,6 +31,7 @@ from ipjax.onboarding.foreground import ForegroundError
 from ipjax.onboarding.mesh import onboard
 from ipjax.onboarding.photo import onboard_photo
 from ipjax.records import Similarity
+from ipjax.robot.cell.camera import Sight
 from ipjax.synthetic.degradation import degrade
 from ipjax.synthetic.objects import make_object
 from ipjax.synthetic.photos import MadePhoto, make_photo
@@ -205,7 +206,7 @@ def place_through_photo(camera_from_object: Similarity, info: ObjectInfo, photo:
     return (relative_pose(camera_from_object, info) @ reference_from_object).to_jax()
 
 
-def write_inputs(folder: Path, scene: Scene, index: int) -> str:
+def write_inputs(folder: Path, scene: Scene | Sight, index: int) -> str:
     """Write photo, depth (16 bits, tenths of a millimetre), mask of one object, and camera; returns their options."""
     write_image(folder / "rgb.png", scene.rgb)
     write_image(folder / "depth.png", np.round(scene.depth * 1e4).astype(np.uint16))

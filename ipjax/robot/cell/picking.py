@@ -65,6 +65,13 @@ class Pick:
         """Whether the arm can do one of the grasps."""
         return self.grasp is not None
 
+    @property
+    def recording_rate(self) -> float:
+        """Frames a second of the recording; 0 where there is none."""
+        if self.recording is None or len(self.recording.times) < 2:
+            return 0.0
+        return float((len(self.recording.times) - 1) / np.ptp(self.recording.times))
+
     def as_json(self) -> dict[str, Any]:
         """The figures with names that end in their unit."""
         return {
