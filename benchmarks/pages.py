@@ -89,6 +89,7 @@ PAGES = (
         benchmarks.table {results}/cpu_2_cores.json {results}/query_cpu_2_cores.json --into README.md
         """,
     ),
+    Page("grasps", "benchmarks.grasps {data}/ycbv -o {out}/grasps --page {results}/grasps.md", ("ycbv",)),
     Page("grasp_planning", "benchmarks.grasp_planning -o {results}/grasp_planning.md"),
     Page("compiling", "benchmarks.compiling --page {results}/compiling.md"),
     Page("bias", "benchmarks.bias --scenes 200 --frames 24 --page {results}/bias.md"),
