@@ -17,7 +17,7 @@ examples:
   ipjax simulate mug.ipjax --mesh mug.obj --unit mm          its pose is estimated from the simulated camera
   ipjax simulate mug.ipjax --diameter 0.14 --seed 3          the mesh in the object file is the thing itself
   ipjax simulate poor.ipjax --mesh drill.obj --unit mm       a poor mesh of it is known, the true one is picked
-  ipjax simulate mug.ipjax --mesh mug.obj --unit mm --detect --clutter 4 --camera wrist
+  ipjax simulate mug.ipjax --mesh mug.obj --unit mm --detect --clutter 4 --mount wrist
 
 A robot stands before a table on which the object lies as it fell, seen by an RGB-D camera with a real one's noise. The
 pose is estimated from that frame, in the simulator's mask or, with --detect, without one; --true-pose takes the true
@@ -66,7 +66,7 @@ def add(commands: Any) -> None:
         help="what carries it (default: the Panda if here)",
     )
     parser.add_argument(
-        "--camera", choices=("fixed", "wrist"), default="fixed", help="opposite to the robot, or on its hand"
+        "--mount", choices=("fixed", "wrist"), default="fixed", help="the camera: opposite to the robot, or on its hand"
     )
     pose = parser.add_mutually_exclusive_group()
     pose.add_argument("--true-pose", action="store_true", help="take the true pose; nothing is estimated")
@@ -113,7 +113,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     )
     messages.print_notes()
     messages.note(f"a cell: {cell.arm.name} with {gripper.name}, {known.info.name} ({1e3 * cell.things[0].mass:.0f} g)")
-    sight = look(cell, arguments.camera)
+    sight = look(cell, arguments.mount)
     seen = int(sight.masks[0].sum())
     if seen < 200:
         raise ValueError(
@@ -322,7 +322,7 @@ def _write(outcome: Outcome, arguments: argparse.Namespace, messages: Messages, 
         "seed": arguments.seed,
         "arm": outcome.cell.arm.name,
         "gripper": outcome.cell.gripper.name,
-        "camera": arguments.camera,
+        "camera": arguments.mount,
         "mass_kg": outcome.cell.things[0].mass,
         "pose_by": "truth" if arguments.true_pose else "detection" if arguments.detect else "estimate in the true mask",
         "pose": None if outcome.result is None else estimate_as_json(outcome.found, known.templates, known.info),
@@ -343,7 +343,7 @@ def _write(outcome: Outcome, arguments: argparse.Namespace, messages: Messages, 
         overlay,
         grasp,
         film,
-        lead=f"{document['arm']} with {document['gripper']}, {arguments.camera} camera, seed {arguments.seed}",
+        lead=f"{document['arm']} with {document['gripper']}, {arguments.mount} camera, seed {arguments.seed}",
         pose_title="The true pose" if outcome.result is None else "The estimated pose",
         every=EVERY,
         facts=_list_facts(document),

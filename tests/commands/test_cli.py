@@ -22,6 +22,7 @@ COMMANDS = (
     "onboard",
     "estimate",
     "grasp",
+    "simulate",
     "demo",
     "doctor",
     "weights",
