@@ -6,7 +6,6 @@ object is a cloud of surface points with outward normals.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -115,6 +114,3 @@ def _row(row, columns):
 
 def _ends(u, inside):
     return jnp.min(jnp.where(inside, u, jnp.inf)), jnp.max(jnp.where(inside, u, -jnp.inf))
-
-
-close_hands_jitted = jax.jit(close_hands, static_argnames=("centred", "batch"))

@@ -1,5 +1,6 @@
 """Hands that close on points: the kernel is its slow twin, and knows the width of what it holds."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ HAND = Hand(
     np.array([[-0.1, -0.03, -0.02], [-0.02, -0.02, -0.06]], np.float32),
     np.array([[0.1, 0.03, 0.066], [0.02, 0.02, -0.02]], np.float32),
 )
+close = jax.jit(close_hands, static_argnames=("centred", "batch"))
 NUMBERS = 0.1, 0.01, 0.3  # retreat, depth, facing
 
 
@@ -33,7 +35,7 @@ def test_kernel_is_its_slow_twin(centred):
     arrays = [jnp.asarray(x, jnp.float32) for x in problem]
     hand = Hand(*(jnp.asarray(x) for x in HAND))
     numbers = [jnp.asarray(x, jnp.float32) for x in NUMBERS]
-    found = close_hands(*arrays, hand, *numbers, centred=centred, batch=5)
+    found = close(*arrays, hand, *numbers, centred=centred, batch=5)
     expected = reference.close_hands(*(np.asarray(x, np.float64) for x in arrays), HAND, *NUMBERS, centred=centred)
     assert (expected["facing"] > 0).mean() > 0.2 and (expected["hits"] > 0).any()
     for name, values in expected.items():
@@ -47,7 +49,7 @@ def test_a_slab_is_as_wide_as_it_is():
     seen = np.repeat([0.0, 1.0], len(side))
     arrays = [jnp.asarray(x, jnp.float32) for x in (points, normals, seen, np.eye(3)[None], np.zeros((1, 3)))]
     hand = Hand(*(jnp.asarray(x) for x in HAND))
-    found = close_hands(*arrays, hand, *(jnp.asarray(x, jnp.float32) for x in NUMBERS), centred=True)
+    found = close(*arrays, hand, *(jnp.asarray(x, jnp.float32) for x in NUMBERS), centred=True)
     np.testing.assert_allclose(found.high - found.low, 0.03, atol=1e-7)
     np.testing.assert_allclose(found.centre, 0.003, atol=1e-7)
     np.testing.assert_allclose(found.cosine, 1, atol=1e-6)
