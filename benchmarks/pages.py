@@ -274,17 +274,29 @@ def make(pages: Sequence[Page], out: Path, data: Path, weights: str | None) -> l
                 continue
             print(f"{page.name}: python -m {key}", flush=True)
             start = time.perf_counter()
-            log = out / f"{page.name}.log"
-            with log.open("a") as file:
-                run = subprocess.run([sys.executable, "-m", *words], cwd=ROOT, stdout=file, stderr=subprocess.STDOUT)
-            if run.returncode:
-                last = (log.read_text(errors="replace").strip().splitlines() or ["it said nothing"])[-1]
-                failed.append(f"{page.name}: {words[0]} ended with status {run.returncode}: {last} ({log})")
+            status, said = run(words)
+            log = write_text(out / f"{page.name}.log", "\n".join(said) + "\n")
+            if status:
+                last = next((line for line in reversed(said) if line.strip()), "it said nothing")
+                failed.append(f"{page.name}: {words[0]} ended with status {status}: {last.strip()} ({log})")
                 break
             done[key] = round(time.perf_counter() - start, 1)
             write_text(journal, json.dumps(done, indent=1) + "\n")
             print(f"{page.name}: {done[key]:.0f} s", flush=True)
     return failed
+
+
+def run(words: Sequence[str]) -> tuple[int, list[str]]:
+    """Run a module, its lines shown as they come; its exit status, and the lines."""
+    said = []
+    with subprocess.Popen(
+        [sys.executable, "-m", *words], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            said.append(line.rstrip("\n"))
+            print(f"    {said[-1]}", flush=True)
+    return process.returncode, said
 
 
 if __name__ == "__main__":
