@@ -24,6 +24,7 @@ from ipjax.commands import (
     evaluate,
     export,
     grasp,
+    label,
     onboard,
     score,
     simulate,
@@ -45,6 +46,7 @@ _COMMANDS = (
     capture,
     calibrate,
     simulate,
+    label,
     degrade,
     export,
 )  # as --help lists them

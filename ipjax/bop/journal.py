@@ -59,7 +59,7 @@ class Journal:
             try:
                 entry = parse_json(line)
                 if number == 1:
-                    differs = _differences(entry, head)
+                    differs = list_differences(entry, head)
                 else:
                     scene, image = entry["image"]
                     rows = [
@@ -93,9 +93,9 @@ def locked_folder(folder: Path) -> Iterator[None]:
         yield
 
 
-def _differences(old: Any, new: Any, where: str = "") -> list[str]:
+def list_differences(old: Any, new: Any, where: str = "") -> list[str]:
     """The names of what differs in two dictionaries of plain JSON."""
     if not (isinstance(old, dict) and isinstance(new, dict)):
         return [] if old == new else [where]
     names = [name for name in {**new, **old} if where or name in new]
-    return [d for n in names for d in _differences(old.get(n), new.get(n), f"{where}.{n}" if where else n)]
+    return [d for n in names for d in list_differences(old.get(n), new.get(n), f"{where}.{n}" if where else n)]

@@ -30,6 +30,7 @@ COMMANDS = (
     "evaluate",
     "capture",
     "calibrate",
+    "label",
     "degrade",
     "export",
 )

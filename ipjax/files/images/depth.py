@@ -14,26 +14,30 @@ _LARGEST_NUMBERS = {float(2**bits - 1) for bits in (15, 16, 31, 32)}
 _LARGEST_NUMBERS |= {float(np.float32(value)) for value in (2**31 - 1, 2**32 - 1)} | {float(np.finfo(np.float32).max)}
 
 
-def read_depth(path: str | Path) -> np.ndarray:
+def read_depth(path: str | Path, content: bytes | None = None) -> np.ndarray:
     """A depth image as its file stores it, in this machine's byte order: uint16 (PNG, TIFF), other integers or floats
     (TIFF, npy), height × width.
+
+    Args:
+        path: of the file.
+        content: of the file, where it lies in another, such as an archive: a PNG.
 
     Raises:
         ValueError: missing, unreadable, 8-bit, coloured, or turned by its EXIF orientation; names the file.
     """
     path = Path(path)
-    if path.suffix.lower() == ".npy":
+    if path.suffix.lower() == ".npy" and content is None:
         depth = load_npy(path)
     elif path.suffix.lower() == ".exr":
         raise ValueError(f"{path}: EXR is not supported; save the depth as 16-bit PNG, float TIFF or npy")
     else:
-        depth = _read_wide_tiff(path)
+        depth = _read_wide_tiff(path) if content is None else None
         if depth is None:
-            image = open_image(path)
+            image = open_image(path, content=content)
             check_upright(get_orientation(image), path)
             if image.mode not in ("I;16", "I;16B", "I;16L", "I;16N", "I", "F"):
                 raise ValueError(f"{path}: depth must be 16-bit or float with one channel, not 8-bit {image.mode}")
-            depth = undo_stretching(image, path)
+            depth = undo_stretching(image, path) if content is None else np.array(image)
             if image.mode == "I" and depth.min() >= 0 and depth.max() < 65536:
                 depth = depth.astype(np.uint16)
     if depth.ndim == 3 and depth.shape[-1] == 1:

@@ -4,6 +4,7 @@ Every reader raises one sentence of `ValueError` that names the file, and none t
 `ipjax.files.storage.budget` allows.
 """
 
+import io
 import re
 import warnings
 from pathlib import Path
@@ -22,13 +23,17 @@ _TAGS_KEPT = "ipjax exif"
 _EXIF = 0x8769  # where the photo's own tags stand
 
 
-def read_rgb(path: str | Path) -> np.ndarray:
+def read_rgb(path: str | Path, content: bytes | None = None) -> np.ndarray:
     """A colour image as uint8, height × width × 3, as it is stored; transparency dropped.
+
+    Args:
+        path: of the file.
+        content: of the file, where it lies in another, such as an archive; ``path`` is then its name in messages.
 
     Raises:
         ValueError: missing, unreadable, absurd, or to be turned according to its EXIF orientation; names the file.
     """
-    image = open_image(path)
+    image = open_image(path, content=content)
     check_upright(get_orientation(image), path)
     if image.mode.startswith("I") or image.mode == "F":
         raise ValueError(f"{path}: a one-channel image of more than 8 bits is no colour image; is this the depth?")
@@ -44,22 +49,25 @@ def read_size(path: str | Path) -> tuple[int, int]:
     return open_image(path, load=False).size
 
 
-def open_image(path: str | Path, *, load: bool = True, max_side: int | None = None) -> Image.Image:
+def open_image(
+    path: str | Path, *, load: bool = True, max_side: int | None = None, content: bytes | None = None
+) -> Image.Image:
     """An image of one of the usual formats, decoded if its header promises no more pixels than memory allows.
 
     Args:
         path: PNG, JPEG, TIFF, BMP, WebP, GIF or PPM.
         load: decode it, too.
         max_side: a JPEG with a longer side may be decoded at a fraction of its size, not below this one.
+        content: as in `read_rgb`.
 
     Raises:
         ValueError: missing, none of these, broken or too large; names the file.
     """
     path = Path(path)
-    if not path.is_file():
+    if content is None and not path.is_file():
         raise ValueError(f"{path}: no such file")
     try:
-        with warnings.catch_warnings(), path.open("rb") as file:
+        with warnings.catch_warnings(), path.open("rb") if content is None else io.BytesIO(content) as file:
             warnings.simplefilter("ignore")
             image = Image.open(file, formats=FORMATS)
             if not load:

@@ -28,7 +28,7 @@ def decode_rle(segmentation: dict) -> np.ndarray:
     # No mask is larger than an image may be.
     check_budget(BYTES_PER_PIXEL * max(height, 0) * max(width, 0), f"a run-length mask of {width} × {height} pixels")
     if isinstance(counts, str | bytes):
-        counts = _decompress(counts)
+        counts = decode_counts(counts)
     # A list in the list would make NumPy speak of its own affairs.
     whole = isinstance(counts, list | tuple | np.ndarray) and not any(isinstance(run, list | dict) for run in counts)
     runs: np.ndarray = np.asarray(counts) if whole else np.zeros((1, 1))
@@ -54,8 +54,11 @@ def encode_rle(mask: np.ndarray, *, compressed: bool = True) -> dict:
     return {"size": list(mask.shape), "counts": _compress(runs) if compressed else runs}
 
 
-def _decompress(text: str | bytes) -> list[int]:
-    """Run lengths from COCO's text: five bits a character, from the third on as differences to the one before last."""
+def decode_counts(text: str | bytes) -> list[int]:
+    """Run lengths from COCO's text: five bits a character, from the third on as differences to the one before last.
+
+    Raises ValueError for what is no such text.
+    """
     data = text.encode("ascii", "replace") if isinstance(text, str) else text
     runs: list[int] = []
     at = 0

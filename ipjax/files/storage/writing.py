@@ -85,15 +85,23 @@ def write_text(path: str | Path, text: str, *, parents: bool = False) -> Path:
 def append_json(path: str | Path, *entries: Any) -> None:
     """Append entries to a file of JSON lines; when this returns they are on disc. `read_lines` reads them.
 
+    Where they cannot be written as a whole, as on a disc that is full, nothing of them is left in the file.
+
     Raises:
         ValueError: an entry has a number that JSON has not (NaN, an infinity).
         OSError: the file cannot be written.
     """
     data = "".join(json.dumps(entry, allow_nan=False) + "\n" for entry in entries).encode()
-    with open(path, "ab") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    size = os.path.getsize(path) if os.path.exists(path) else 0
+    try:
+        with open(path, "ab") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.truncate(path, size)
+        raise
 
 
 def read_lines(path: str | Path, *, repair: bool = False) -> list[str]:

@@ -1,0 +1,1 @@
+"""Labels as others read them: BOP's files, COCO's masks, tables, pictures."""
