@@ -91,6 +91,7 @@ PAGES = (
     ),
     Page("grasps", "benchmarks.grasps {data}/ycbv -o {out}/grasps --page {results}/grasps.md", ("ycbv",)),
     Page("grasp_planning", "benchmarks.grasp_planning -o {results}/grasp_planning.md"),
+    Page("labelling_costs", "benchmarks.labelling_costs --page {results}/labelling_costs.md"),
     Page("compiling", "benchmarks.compiling --page {results}/compiling.md"),
     Page("bias", "benchmarks.bias --scenes 200 --frames 24 --page {results}/bias.md"),
     Page(

@@ -1,12 +1,14 @@
-"""Templates with fewer patches, and of one size for several objects, so that one program estimates them all."""
+"""Templates with fewer patches, and of one size for several objects, so that one program estimates them all; and
+batches divided among the devices of a process."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Int
 
 from ipjax.records import Templates
@@ -128,6 +130,51 @@ def thin_templates(templates: Templates, count: int) -> tuple[Templates, Int[np.
     return dataclasses.replace(
         templates, **{name: jax.tree.map(lambda x: x[kept], getattr(templates, name)) for name in parts}
     ), kept
+
+
+class Spread:
+    """The first axis of a batch, divided among devices of one process; each works on its part alone.
+
+    Each device runs the program of its own part: left to itself, the compiler would make the loops of all devices wait
+    for one another at every turn, to learn whether any of them goes on.
+
+    Args:
+        devices: None = all that this process has.
+    """
+
+    def __init__(self, devices: Sequence[Any] | None = None):
+        self.devices = tuple(jax.local_devices() if devices is None else devices)
+        self._mesh = Mesh(np.array(self.devices), ("batch",))
+        self._copies: dict[Any, tuple[Any, Any]] = {}
+
+    def fits(self, size: int) -> bool:
+        """Whether there are several devices, and a batch of this size gives each of them as much."""
+        return len(self.devices) > 1 and size % len(self.devices) == 0
+
+    def divide(self, batch: Any) -> Any:
+        """Arrays whose first axis is divided among the devices."""
+        return jax.device_put(batch, NamedSharding(self._mesh, PartitionSpec("batch")))
+
+    def copy(self, name: Any, given: Any) -> Any:
+        """What all parts need, on every device; it is copied once, and again when another is given by this name."""
+        known, copied = self._copies.get(name, (None, None))
+        if known is not given:
+            copied = jax.device_put(given, NamedSharding(self._mesh, PartitionSpec()))
+            self._copies[name] = given, copied
+        return copied
+
+    def over(self, function: Callable, divided: Sequence[bool]) -> Callable:
+        """A function of batches as one that each device calls with its part.
+
+        Args:
+            function: its results have the batch's axis first.
+            divided: of each argument, whether it is divided among the devices or the same on all.
+        """
+        specs = tuple(PartitionSpec("batch") if one else PartitionSpec() for one in divided)
+        # Its loops would have to be told which of their values differ between devices; nothing here is shared.
+        return jax.shard_map(
+            function, mesh=self._mesh, in_specs=specs, out_specs=PartitionSpec("batch"), check_vma=False
+        )
 
 
 def _pad_all(objects: Sequence[Templates]) -> list[Templates]:

@@ -14,7 +14,7 @@ from ipjax.config import Config
 from ipjax.estimation.features import describe
 from ipjax.estimation.pipeline import estimate
 from ipjax.files.objects.record import ObjectInfo
-from ipjax.inference.batching import compact, pad_alike
+from ipjax.inference.batching import Spread, compact, pad_alike
 from ipjax.inference.frames import frame_turned
 from ipjax.records import Patches, PoseEstimate, Query, Similarity, Templates, View
 
@@ -82,6 +82,7 @@ class Estimator:
         self._compiled: dict[Any, Any] = {}
         self._compiling = threading.RLock()
         self._compacted: dict[int, Templates] = {}
+        self._spread = Spread()
         if alike:
             padded = pad_alike([compact(templates, multiple=MULTIPLE) for templates, _ in self.objects])
             self.objects = [(one, info) for one, (_, info) in zip(padded, self.objects, strict=True)]
@@ -152,6 +153,8 @@ class Estimator:
     ) -> list[Result]:
         """Estimate one object in several crops at once: the same as `run` of each, up to rounding.
 
+        Where this process has several devices and ``size`` is a multiple of their number, each takes its part.
+
         Args:
             index: of the object.
             crops: each from `frame`.
@@ -178,13 +181,22 @@ class Estimator:
         views = jax.tree.map(lambda *x: jnp.stack(x), *views)
         keys = jnp.stack([jax.random.key(seed) for seed in (*seeds, *[seeds[0]] * more)])
         known = None if diameter is None else jnp.asarray(diameter, jnp.float32)
-        describe_compiled = self.compiled("describe all", _describe_all, seconds, self.encoder, views)
+        encoder, config, where = self.encoder, self.config, ""
+        describe_batch, estimate_batch = _describe_all, _estimate_all
+        if self._spread.fits(size):
+            spread, where = self._spread, ", divided"
+            views, keys = spread.divide((views, keys))
+            encoder, config = spread.copy("encoder", encoder), spread.copy("config", config)
+            templates, known = spread.copy(index, templates), spread.copy(("diameter", diameter), known)
+            describe_batch = spread.over(describe_batch, (False, True))
+            estimate_batch = spread.over(estimate_batch, (False, False, True, True, False, False))
+        describe_compiled = self.compiled(f"describe all{where}", describe_batch, seconds, encoder, views)
         start = time.perf_counter()
-        patches = jax.block_until_ready(describe_compiled(self.encoder, views))
+        patches = jax.block_until_ready(describe_compiled(encoder, views))
         seconds["describe"] = time.perf_counter() - start
         queries = Query(patches=patches, view=views)
-        arguments = self.encoder, templates, queries, keys, self.config, known
-        estimate_compiled = self.compiled("estimate all", _estimate_all, seconds, *arguments)
+        arguments = encoder, templates, queries, keys, config, known
+        estimate_compiled = self.compiled(f"estimate all{where}", estimate_batch, seconds, *arguments)
         start = time.perf_counter()
         found = jax.block_until_ready(estimate_compiled(*arguments))
         seconds["estimate"] = time.perf_counter() - start

@@ -67,7 +67,8 @@ class Labeller:
         self.infos = [info for _, info in objects]
         self.diameters = [None if settings.free_size else info.measured_diameter for info in self.infos]
         on_cpu = jax.default_backend() == "cpu"
-        self.buckets = settings.buckets or ((1,) if on_cpu else _ACCELERATOR_BUCKETS)
+        each = (1,) if on_cpu else _ACCELERATOR_BUCKETS
+        self.buckets = settings.buckets or tuple(jax.local_device_count() * size for size in each)
         self.threads = settings.threads or min(_count_cores(), _MOST_THREADS)
         self._made: dict[bool, Estimator] = {}
         self._detector: Detector | None = None

@@ -58,7 +58,8 @@ class LabelSettings:
         seeking: settings of the estimates that verify where they are; None = `Config.fast`.
         free_size: estimate the size also of objects whose reference photo measured it.
         buckets: numbers of crops that a program is compiled for; a group of crops is cut into these and padded with
-            repeats. None = one crop at a time on a CPU, up to 8 elsewhere.
+            repeats. None = one crop at a time on a CPU, up to 8 elsewhere; as many for each device where a process has
+            several. A bucket that is a multiple of the number of devices is divided among them.
         threads: crops, or buckets of them, that are worked on at the same time; None = one for each core, at most 4.
     """
 
