@@ -2,15 +2,15 @@
 
     python -m benchmarks.labelling_costs [--page benchmarks/results/labelling_costs.md]
 
-FLOP and bytes are XLA's (`cost_analysis` of the compiled stages). XLA counts the body of a loop once; here each counts
-as often as it is run, where that is known when it is compiled (`counted`). Loops whose end depends on data count once.
+FLOP and bytes are XLA's (`cost_analysis` of the compiled stages), but with loops counted as often as they are run
+(`benchmarks.counting`).
 """
 
 import argparse
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jax.extend import core
 
+from benchmarks.counting import NOTHING, Cost, counted
 from benchmarks.measure import commit, describe_device
 from benchmarks.queries import BLOCK, PRESET, StandInWithDinov2
 from benchmarks.stages import match_only, refine_all, score_all
@@ -44,72 +44,6 @@ PAGE = Path(__file__).with_name("results") / "labelling_costs.md"
 SHORTLIST = 50
 PAPER_DAYS = 45  # days of one GPU for a million frames of one object, as the paper says
 DEVICES = (1, 8, 64)
-
-
-@dataclasses.dataclass(frozen=True)
-class Cost:
-    """Of one call: floating-point operations and bytes read and written, as XLA counts them."""
-
-    flop: float
-    bytes: float
-
-    def __add__(self, other: "Cost") -> "Cost":
-        return Cost(self.flop + other.flop, self.bytes + other.bytes)
-
-    def times(self, count: float) -> "Cost":
-        return Cost(count * self.flop, count * self.bytes)
-
-
-def counted(function: Callable, *arguments: Any, programs: tuple[Any, Any] | None = None) -> Cost:
-    """What a function costs, loops as often as they are run.
-
-    FLOP are those of the program as it was traced, bytes those of the compiled one, whose fused steps write nothing.
-
-    Args:
-        programs: the function lowered and compiled for these arguments, if it has been.
-    """
-    return _count(jax.make_jaxpr(function)(*arguments), {}, programs)[1]
-
-
-def _count(
-    traced: core.ClosedJaxpr, known: dict[str, tuple[Cost, Cost]], programs: tuple[Any, Any] | None = None
-) -> tuple[Cost, Cost]:
-    """The cost with every loop counted once, as XLA does, and with each as often as it is run."""
-    name = str(traced.jaxpr)
-    if name not in known:
-        if programs is None:
-            given = [jax.ShapeDtypeStruct(x.shape, x.dtype, weak_type=x.weak_type) for x in traced.in_avals]
-            lowered = jax.jit(core.jaxpr_as_fun(traced)).lower(*given)
-            programs = lowered, lowered.compile()
-        once = Cost(_figure(programs[0], "flops"), _figure(programs[1], "bytes accessed"))
-        whole = once
-        for body, count in _loops(traced.jaxpr):
-            body_once, body_whole = _count(body, known)
-            whole = whole + body_whole.times(count) + body_once.times(-1)
-        known[name] = once, whole
-    return known[name]
-
-
-def _figure(program: Any, name: str) -> float:
-    found = program.cost_analysis()
-    return max(float((found or {}).get(name, 0.0)), 0.0)
-
-
-def _loops(jaxpr: core.Jaxpr) -> Iterator[tuple[core.ClosedJaxpr, int]]:
-    """Bodies of the loops that are not within others, and how often each is run."""
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "scan":
-            yield equation.params["jaxpr"], equation.params["length"]
-            continue
-        parts = list(equation.params.values())
-        if equation.primitive.name == "cond" and equation.params.get("branches_platforms"):
-            here = [n for n, names in enumerate(equation.params["branches_platforms"]) if names and "cpu" in names]
-            parts = [equation.params["branches"][here[0] if here and jax.default_backend() == "cpu" else -1]]
-        for part in parts:
-            for one in part if isinstance(part, list | tuple) else [part]:
-                inner = one.jaxpr if isinstance(one, core.ClosedJaxpr) else one
-                if isinstance(inner, core.Jaxpr):
-                    yield from _loops(inner)
 
 
 def spent(call: Callable[[], Any], least: float = 1.0, most: int = 12) -> float:
@@ -225,10 +159,16 @@ def with_shortlist(config: Config, shortlist: int | None) -> Config:
 
 
 def measure_roof() -> tuple[float, float]:
-    """FLOP/s and bytes/s of one core at work: a product of 2048² float32 matrices, and a sum of two large arrays."""
-    matrix, long = jnp.ones((2048, 2048)), jnp.ones(2**26)
-    product, add = jax.jit(lambda x: x @ x), jax.jit(lambda x: x + 1)
-    return 2 * 2048**3 / spent(lambda: product(matrix)), 2 * long.nbytes / spent(lambda: add(long))
+    """FLOP/s and bytes/s of one core at work: a product of 2048² float32 matrices, and 1 added to 256 MB in place."""
+    matrix, place = jnp.ones((2048, 2048)), [jnp.ones(2**26)]
+    product, add = jax.jit(lambda x: x @ x), jax.jit(lambda x: x + 1, donate_argnums=0)
+
+    def step() -> Any:
+        place[0] = add(place[0])
+        return place[0]
+
+    moved = 2 * place[0].nbytes
+    return 2 * 2048**3 / spent(lambda: product(matrix)), moved / spent(step)
 
 
 def bound(row: Row, flop_rate: float, byte_rate: float) -> str:
@@ -254,7 +194,7 @@ def stage_lines(rows: list[Row], flop_rate: float, byte_rate: float) -> list[str
         known = ["–"] * 3 if cost is None else [f"{cost.flop / 1e9:.3g}", f"{cost.bytes / 1e6:.3g}", _intensity(cost)]
         cells.append([row.name, *known, f"{1e3 * row.seconds:.3g}", bound(row, flop_rate, byte_rate)])
     costs = [row.cost for row in rows if row.cost is not None]
-    total, seconds = sum(costs, Cost(0, 0)), sum(row.seconds for row in rows)
+    total, seconds = sum(costs, NOTHING), sum(row.seconds for row in rows)
     known = [f"{total.flop / 1e9:.3g}", f"{total.bytes / 1e6:.3g}", _intensity(total)]
     cells.append(["**all**", *known, f"{1e3 * seconds:.3g}", ""])
     return table(["stage", "GFLOP", "MB", "FLOP per byte", "ms of a core", "bound by, share of it reached"], cells)
@@ -313,8 +253,9 @@ def main() -> None:
         "given, random weights of DINOv2 S/14. Milliseconds are of one core at work, those of all threads added up: "
         "other work on the machine does not lengthen them as it does the clock's. GFLOP and MB are XLA's "
         "`cost_analysis` (of the traced and of the compiled program), with the body of each loop as often as it is "
-        "run; the drawing's loop, whose end depends on the data, counts once. What bounds a stage: a product of "
-        f"2048² matrices does {flop_rate / 1e9:.3g} GFLOP/s for each core at work, and adding to an array of 256 MB "
+        "run; the drawing's loop, whose end depends on the data, counts once, and of the sizes that matching is "
+        "compiled for the one that this query takes. What bounds a stage: a product of "
+        f"2048² matrices does {flop_rate / 1e9:.3g} GFLOP/s for each core at work, and adding to 256 MB in place "
         f"moves {byte_rate / 1e9:.3g} GB/s: {flop_rate / byte_rate:.2g} FLOP per byte is where the two meet. What the "
         "caches hold goes faster than that, and its share can exceed 100 %.",
         "",

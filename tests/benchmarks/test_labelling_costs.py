@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import pytest
 from jax import lax
 
-from benchmarks.labelling_costs import Cost, Row, bound, counted, hour_lines, stage_lines
+from benchmarks.counting import Cost, counted
+from benchmarks.labelling_costs import Row, bound, hour_lines, stage_lines
 
 X = jnp.ones((32, 32))
 cube = lambda x: jnp.zeros((32, *x.shape))
@@ -21,8 +22,10 @@ ONE = 2 * 32**3  # a product
         (lambda x: lax.fori_loop(0, 3, lambda _, c: lax.fori_loop(0, 5, lambda _, d: d @ d, c) @ c, x), 18),
         (lambda x: jax.jit(lambda y: lax.map(lambda row: y @ y @ row, y))(x), 32 + 1),
         (lambda x: lax.platform_dependent(x, cpu=lambda y: lax.map(lambda _: y @ y, y), default=cube), 32),
+        (lambda x: lax.cond(jnp.sum(x) > 0, jax.jit(lambda y: y @ y), lambda y: y @ y @ y @ y, x), 1),
+        (lambda x: jax.jit(lambda y: lax.switch(jnp.int32(y[0, 0]), [lambda: y @ y @ y @ y, lambda: y @ y @ y]))(x), 2),
     ],
-    ids=["straight", "scan", "fori", "nested", "within jit", "by platform"],
+    ids=["straight", "scan", "fori", "nested", "within jit", "by platform", "branch", "branch within jit"],
 )
 def test_the_body_of_a_loop_counts_as_often_as_it_is_run(function, products):
     cost = counted(function, X)
