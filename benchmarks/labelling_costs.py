@@ -273,8 +273,9 @@ def main() -> None:
         "",
         *stage_lines(rows, flop_rate, byte_rate),
         "",
-        f"The stages were compiled apart, so that they can be told apart: {1e3 * apart:.3g} ms without crop and visible "
-        f"mask. As one program, as labels are made, with confidence and covariance, they take {1e3 * together:.3g} ms.",
+        f"The stages were compiled apart, so that they can be told apart: {1e3 * apart:.3g} ms without crop and "
+        "visible mask. As one program, as labels are made, with confidence and covariance, they take "
+        f"{1e3 * together:.3g} ms.",
         "",
         "## More templates, more objects",
         "",
