@@ -68,7 +68,7 @@ def parse_rigid(value: Any, scale: float = 1.0) -> Similarity[np.ndarray]:
     """
     try:
         matrix = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("a rigid motion is a matrix of 4 × 4 numbers, row by row") from None
     if matrix.shape != (4, 4):
         raise ValueError(f"a rigid motion is a matrix of 4 × 4 numbers, not of shape {list(matrix.shape)}")
@@ -113,6 +113,11 @@ def _pick(document: dict[str, Any], name: str) -> Any:
 
 def _read_unit(document: dict[str, Any]) -> float:
     unit = document.get("unit", document.get("units", "m"))
-    if unit not in UNITS:
-        raise ValueError(f"its unit is {unit!r}; m or mm is expected")
+    check_unit(unit)
     return UNITS[unit]
+
+
+def check_unit(unit: Any) -> None:
+    """Raises ValueError where what a file says is none of `UNITS`."""
+    if not isinstance(unit, str) or unit not in UNITS:
+        raise ValueError(f"its unit is {unit!r}; m or mm is expected")

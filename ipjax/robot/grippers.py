@@ -33,6 +33,7 @@ ROBOTIQ_2F_85 = Gripper(
 GRIPPERS = {"franka": FRANKA_HAND, "robotiq": ROBOTIQ_2F_85}
 
 _FORMAT = "ipjax gripper 1"
+_LONGEST = 2.0  # m: of any length of a hand; beyond, they are millimetres
 _FIELDS = {
     "opening_m": ("opening", "the largest width between the pads"),
     "reach_m": ("reach", "from the origin along z to the middle of the pads"),
@@ -76,7 +77,11 @@ def parse_gripper(entry: Any) -> Gripper:
         numbers = _read_numbers(entry.get(key), many, f"'{key}' ({what})")
         if min(numbers) <= 0:
             raise ValueError(f"'{key}' ({what}) is positive, not {entry[key]!r}")
+        if field != "force" and max(numbers) > _LONGEST:
+            raise ValueError(f"'{key}' ({what}): {max(numbers):g} m are no hand's: lengths are in metres")
         values[field] = numbers if many == 2 else numbers[0]
+    if values["pad"][0] > values["finger"][0]:
+        raise ValueError("'pad_m': the pads are longer along z than the fingers that they are on, 'finger_m'")
     given = entry.get("boxes", [])
     if not isinstance(given, list) or not all(isinstance(box, dict) for box in given):
         raise ValueError("'boxes' is a list of the body's boxes, each with 'centre_m' and 'half_sizes_m'")
@@ -115,6 +120,10 @@ def _read_numbers(value: Any, count: int, what: str) -> tuple[float, ...]:
     if not fits or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in values):
         wanted = "a number" if count == 1 else f"a list of {count} numbers"
         raise ValueError(f"{what} is {wanted}, in metres or newtons, not {value!r}")
-    if not all(math.isfinite(x) for x in values):
-        raise ValueError(f"{what} is finite, not {value!r}")
+    try:
+        finite = all(math.isfinite(x) for x in values)
+    except OverflowError:  # a whole number of hundreds of digits
+        finite = False
+    if not finite:
+        raise ValueError(f"{what} is finite, not {str(value)[:40]}")
     return tuple(float(x) for x in values)

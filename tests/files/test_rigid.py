@@ -42,6 +42,8 @@ def test_a_bare_matrix_short_decimals_millimetres_and_yaml_are_read(tmp_path):
         ("[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]", "mirrors"),
         ("[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]", "enlarges by 2"),
         ("[[1, 0, 0, 410], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "these are millimetres"),
+        ("[[1" + 400 * "0" + "]]", "4 × 4 numbers, row by row"),
+        ('{"base_from_camera": [], "unit": ["m"]}', r"its unit is \['m'\]; m or mm"),
         ('{"base_from_camera": [], "unit": "inch"}', "its unit is 'inch'; m or mm"),
     ],
 )

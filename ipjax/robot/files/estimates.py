@@ -53,8 +53,10 @@ def _find(document: Any, name: str, frame: str | None, instance: int | None) -> 
         if not frames:
             raise ValueError(f"there is no frame {frame!r}")
     if len(frames) > 1:
-        raise ValueError(f"there are {len(frames)} frames: say which with --frame, for instance {frames[0]['frame']}")
-    objects = [one for one in frames[0].get("objects", []) if isinstance(one, dict)]
+        named = f", for instance {frames[0]['frame']}" if "frame" in frames[0] else ""
+        raise ValueError(f"there are {len(frames)} frames: say which with --frame{named}")
+    objects = frames[0].get("objects")
+    objects = [one for one in objects if isinstance(one, dict)] if isinstance(objects, list) else []
     found = [one for one in objects if one.get("object") == name]
     if not found:
         there = ", ".join(sorted({str(one.get("object")) for one in objects})) or "no object"
@@ -90,18 +92,23 @@ def _build(entry: dict[str, Any], templates: Templates, info: ObjectInfo) -> Pos
     if covariance.shape != (6, 6) or turn.shape != (3,) or box.shape != (2, 3):
         raise KeyError
     array = lambda x: jnp.asarray(np.asarray(x, np.float64), jnp.float32)
-    numbers = [pose.rotation, pose.translation, pose.scale, covariance, turn, box, scores]
+    diameter, deviation = float(size["diameter"]), float(size["diameter_std"])
+    numbers = [pose.rotation, pose.translation, pose.scale, covariance, turn, box, scores, diameter, deviation]
     if not all(np.isfinite(x).all() for x in numbers):
         raise ValueError("the estimate is not finite")
+    if pose.translation[2] <= 0:
+        raise ValueError(f"{info.name} is behind the camera there, at z = {pose.translation[2]:.3g} m")
+    if diameter <= 0 or deviation < 0:
+        raise ValueError(f"a diameter of {diameter:g} mm ± {deviation:g} mm is none")
     zero = jnp.zeros((), jnp.float32)
     return PoseEstimate(
         camera_from_object=pose.to_jax(),
         confidence=array(entry["confidence"]),
         present=jnp.asarray(bool(entry["present"])),
         covariance=array(covariance),
-        diameter=array(1e-3 * float(size["diameter"])),
+        diameter=array(1e-3 * diameter),
         box=array(box),
-        scale_std=array(1e-3 * float(size["diameter_std"])),
+        scale_std=array(1e-3 * deviation),
         ambiguity=array(turn),
         agreement=Agreement(zero, zero, zero, zero, zero, zero),
         hypotheses=Hypotheses(Similarity[np.ndarray].stack(others).to_jax(), array(scores)),

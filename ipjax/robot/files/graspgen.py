@@ -70,7 +70,7 @@ def _read(document: Any, gripper: Gripper) -> GraspList:
         raise ValueError("not GraspGen's grasps: 'grasps' with 'transforms' is expected")
     try:
         matrices = np.asarray(entry["transforms"], np.float64).reshape(-1, 4, 4)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("'transforms' is a list of 4 × 4 matrices") from None
     try:
         poses = to_rigid(matrices)
@@ -87,8 +87,10 @@ def _read(document: Any, gripper: Gripper) -> GraspList:
     try:
         width = np.array([np.nan if x is None else float(x) for x in widths])
         scale = float(about.get("scale", 1.0))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("'width_m' and the object's 'scale' are numbers") from None
+    if not 0 < scale < np.inf:
+        raise ValueError(f"the object's 'scale' is positive and finite, not {scale:g}")
     order = np.argsort(-scores, kind="stable")
     return GraspList(
         mesh_from_gripper=turn_closing(poses.take(order), CLOSING, gripper.closing),

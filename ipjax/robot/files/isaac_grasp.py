@@ -128,6 +128,8 @@ def _read(document: Any, gripper: Gripper, closing: str | None) -> GraspList:
         np.ones(count),
     )
     scale = _read_numbers([document.get("object_scale", 1.0)], 1, "object_scale")[0]
+    if scale <= 0:
+        raise ValueError(f"object_scale is positive, not {scale:g}")
     return GraspList(
         mesh_from_gripper=turn_closing(poses, str(axis), gripper.closing),
         score=np.asarray(scores, np.float64)[order],
@@ -154,6 +156,10 @@ def _read_numbers(values: Any, count: int, what: str) -> np.ndarray:
     fits = isinstance(values, list) and len(values) == count
     if not fits or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in values):
         raise ValueError(f"{what}: {'a number is' if count == 1 else f'{count} numbers are'} expected")
-    if not np.isfinite(np.asarray(values, np.float64)).all():
+    try:
+        numbers = np.asarray(values, np.float64)
+    except OverflowError:  # a whole number of hundreds of digits
+        numbers = np.full(count, np.inf)
+    if not np.isfinite(numbers).all():
         raise ValueError(f"{what}: it is not finite")
-    return np.asarray(values, np.float64)
+    return numbers

@@ -90,7 +90,7 @@ def read_scores(values: Any, count: int, what: str) -> np.ndarray:
     """A number from 0 to 1 for each grasp. Raises ValueError for anything else; ``what`` names it."""
     try:
         scores = np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         scores = np.zeros(0)
     if scores.shape != (count,) or not ((scores >= 0) & (scores <= 1)).all():
         raise ValueError(f"{what}: a number from 0 to 1 is expected for each of the {count} grasps")

@@ -44,8 +44,8 @@ def check_motion(base_from_gripper: Similarity[np.ndarray], what: str = "views o
     count = len(base_from_gripper.scale)
     if count < FEWEST:
         raise HandEyeError(
-            f"{count} {what}: {FEWEST} is the least, 15 is usual; take more, and {WHAT_TO_DO} (hold the board's "
-            "whole picture sharp)"
+            f"too few {what}, {count}: {FEWEST} is the least, 15 is usual; take more, and {WHAT_TO_DO} (hold the "
+            "board's whole picture sharp)"
         )
     widest, across = measure_turns(base_from_gripper)
     if widest < LEAST:

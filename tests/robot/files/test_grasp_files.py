@@ -98,6 +98,8 @@ def test_the_documented_example_is_read(tmp_path):
         (lambda d: d["grasps"]["grasp_1"]["orientation"].update(w=3.0), "'grasp_1': the orientation is no unit"),
         (lambda d: d["grasps"]["grasp_1"].update(position=[0, 1]), "'grasp_1': position: 3 numbers"),
         (lambda d: d["grasps"]["grasp_1"].update(position=[0, 1, float("nan")]), "'grasp_1': position: it is not fin"),
+        (lambda d: d["grasps"]["grasp_1"].update(position=[10**400, 0, 0]), "'grasp_1': position: it is not finite"),
+        (lambda d: d.update(object_scale=0), "object_scale is positive, not 0"),
         (lambda d: d["grasps"]["grasp_1"].update(confidence=7), "'grasp_1': confidence: a number from 0 to 1"),
     ],
 )
@@ -120,6 +122,8 @@ def test_what_is_wrong_with_isaac_grasp_is_said(grasps, change, said, tmp_path):
         (lambda d: d["grasps"].update(confidence=[0.5]), "for each of the 4 grasps"),
         (lambda d: d["grasps"].update(width_m=[0.5]), "'width_m': a number, or null"),
         (lambda d: d["object"].update(scale="mm"), "are numbers"),
+        (lambda d: d["object"].update(scale=float("nan")), "'scale' is positive and finite, not nan"),
+        (lambda d: d["grasps"]["transforms"][0][0].__setitem__(3, 10**400), "a list of 4 × 4 matrices"),
     ],
 )
 def test_what_is_wrong_with_graspgen_is_said(grasps, change, said, tmp_path):

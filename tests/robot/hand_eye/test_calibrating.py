@@ -94,7 +94,7 @@ def test_motion_that_tells_nothing_is_refused_with_what_to_do(turns, said):
 
 def test_too_few_views_are_refused_and_small_turns_noted():
     made = make_calibration(5, COUNT)
-    with pytest.raises(HandEyeError, match="3 views of the board: 4 is the least, 15 is usual"):
+    with pytest.raises(HandEyeError, match="too few views of the board, 3: 4 is the least, 15 is usual"):
         calibrate(made.camera_from_board.take(slice(3)), made.base_from_gripper.take(slice(3)), "in-hand")
     gentle = make_calibration(5, COUNT, tilt=8.0, roll=15.0, camera_noise=(1e-4, 1e-4))
     found = calibrate(gentle.camera_from_board, gentle.base_from_gripper, "in-hand")

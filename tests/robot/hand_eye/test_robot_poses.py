@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ipjax.robot.hand_eye.reading.observing import list_images
 from ipjax.robot.hand_eye.reading.pose_forms import Form
 from ipjax.robot.hand_eye.reading.robot_poses import RobotPoses, pair, read_robot_poses
 from ipjax.robot.hand_eye.records import HandEyeError
@@ -111,6 +112,8 @@ NOT_FINITE = '{"000004": [[1, 0, 0, NaN], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 
         ("a,b,c,d\n1,2,3", {}, "line 2: 3 entries, but the first row names 4"),
         ("1 2 3 4 5 6\n1 2 x y 5 6", {}, "line 2: numbers are expected"),
         ({"unit": "inch", "poses": []}, {}, "its unit is 'inch'"),
+        ({"unit": ["m"], "poses": []}, {}, r"its unit is \['m'\]"),
+        ([[10**400, 0, 0, 0, 0, 0]], {"rotation": "rpy"}, "pose 1: a pose is numbers"),
         ([{"name": "a", "matrix": BROKEN}, {"name": "a", "matrix": BROKEN}], {}, "there are two poses of a"),
         ([{"name": "a", "matrix": BROKEN}, {"matrix": BROKEN}], {}, "some poses have names and others have none"),
     ],
@@ -138,3 +141,10 @@ def test_names_that_meet_nothing_are_told():
     assert notes == ["img_06: there is no pose of this name", "no image of the pose of pose_12.json"]
     with pytest.raises(HandEyeError, match=r"no image has the name of a pose: images are called left\.png"):
         pair([Path("left.png")], poses)
+
+
+def test_images_are_in_the_order_of_their_numbers(tmp_path):
+    for name in ("10", "9", "a2", "a10", "²"):  # the last is a digit to Python, and no number
+        (tmp_path / f"{name}.png").touch()
+    found = [path.stem for path in list_images([tmp_path])]
+    assert found == ["9", "10", "a2", "a10", "²"]

@@ -53,7 +53,7 @@ def list_images(given: Sequence[Path]) -> list[Path]:
             found.append(path)
         else:
             raise HandEyeError(f"{path}: no such image or folder")
-    found.sort(key=lambda path: [int(w) if w.isdigit() else w for w in re.split(r"(\d+)", path.stem)])
+    found.sort(key=lambda path: [int(w) if i % 2 else w for i, w in enumerate(re.split(r"(\d+)", path.stem))])
     names = [path.stem for path in found]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)

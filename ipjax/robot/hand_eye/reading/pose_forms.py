@@ -168,7 +168,7 @@ def _read_matrix(matrix: np.ndarray, flat: bool) -> RawPose:
 def _as_numbers(value: Any) -> np.ndarray:
     try:
         numbers = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise ValueError("a pose is numbers") from None
     if not np.isfinite(numbers).all():
         raise ValueError("a pose has a number that is not finite")

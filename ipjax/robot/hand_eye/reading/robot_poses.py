@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ipjax.files.rigid import FARTHEST, UNITS, to_rigid
+from ipjax.files.rigid import FARTHEST, UNITS, check_unit, to_rigid
 from ipjax.files.storage.parsing import parse, read_text
 from ipjax.files.wording import abbreviate
 from ipjax.robot.hand_eye.reading.pose_forms import Form, RawPose, read_pose, to_rotation
@@ -137,8 +137,8 @@ def _read_rows(text: str, form: Form) -> tuple[list[tuple[str | None, Any]], str
     document, unit = parse(text), None
     if isinstance(document, Mapping):
         unit = document.get("unit", document.get("units"))
-        if unit is not None and unit not in UNITS:
-            raise ValueError(f"its unit is {unit!r}; m or mm is expected")
+        if unit is not None:
+            check_unit(unit)
         inner = next((document[key] for key in ("poses", "base_from_gripper", "robot_poses") if key in document), None)
         document = {k: v for k, v in document.items() if k not in ("unit", "units")} if inner is None else inner
     if isinstance(document, Mapping):
