@@ -85,6 +85,9 @@ def judge(
     spare = hand.opening / 2 - jnp.maximum(jnp.abs(touch.low), jnp.abs(touch.high))
     spare = jnp.where(jnp.isfinite(spare), spare, 0)
     valid = given & _holds(touch, solid, hand, config) & (spare > config.least_spare)
+    if isinstance(estimate, PoseEstimate):
+        # No pose, no grasp; and an uncertainty that is not known is not taken for none.
+        valid &= estimate.success & jnp.all(jnp.isfinite(estimate.covariance))
     if around.normal is not None and around.offset is not None:
         _, height = above_table(poses, hand, around.normal, around.offset, config)
         valid &= height > 0.99 * config.clearance

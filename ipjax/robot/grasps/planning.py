@@ -42,7 +42,8 @@ def plan_grasps(
     Args:
       gripper: see :mod:`ipjax.robot.grippers`.
       templates: the object, or its surface alone.
-      estimate: with its uncertainty; a pose alone, ``camera_from_object`` in metres per model unit, is taken as exact.
+      estimate: with its uncertainty; where it has no ``success`` there is no grasp. A pose alone,
+        ``camera_from_object`` in metres per model unit, is taken as exact.
       workspace: the table and the measured depth, camera frame; ``Workspace()`` knows of nothing. Without a table the
         wanted approach is the camera's view, in place of straight down.
       key: of the pairs and poses that are drawn.

@@ -271,6 +271,15 @@ def test_what_is_not_finite_is_not_valid(box):
     assert all(np.isfinite(np.asarray(x)).all() for x in jax.tree.leaves(found))
 
 
+def test_an_estimate_that_failed_or_knows_not_how_sure_it_is_gives_no_grasp(box):
+    sure = estimate_of(from_above(box.diameter))
+    unknown = dataclasses.replace(sure, covariance=sure.covariance * jnp.nan)
+    failed = dataclasses.replace(sure, success=jnp.asarray(False))
+    for estimate, count in ((sure, GraspConfig().grasps), (unknown, 0), (failed, 0)):
+        found = plan(FRANKA_HAND, box.surface, estimate, on_table(box), KEY, GraspConfig())
+        assert np.asarray(found.valid).sum() == count
+
+
 def test_vmapped_the_papers_are_the_same(box):
     poses = [estimate_of(from_above(box.diameter), turn_std=std) for std in (0.01, 0.05)]
     many, keys = jax.tree.map(lambda *x: jnp.stack(x), *poses), jax.random.split(KEY, 2)
