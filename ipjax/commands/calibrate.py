@@ -108,6 +108,7 @@ def _check(arguments: argparse.Namespace) -> None:
     options.check_output(arguments.output, (".json",))
     if arguments.report is not None:
         options.check_output(arguments.report, (".html", ".htm"))
+    options.check_apart([arguments.output, arguments.report], [arguments.robot_poses, arguments.camera])
 
 
 def _print_board(board: Any, arguments: argparse.Namespace, messages: Messages) -> int:

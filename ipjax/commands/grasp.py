@@ -14,7 +14,8 @@ examples:
   ipjax grasp mug.ipjax --pose pose.json --base-from-camera hand_eye.json --table 0.0 -o grasps.json
   ipjax grasp mug.ipjax --pose pose.json --base-from-camera hand_eye.json --table 0.0 --depth depth.png \\
       --camera camera.json --rgb rgb.png --overlay grasps.png -o grasps.json     heeds what else is there, draws it
-  ipjax grasp mug.ipjax --pose pose.json --gripper robotiq --top-down -o grasps.yaml     isaac_grasp
+  ipjax grasp mug.ipjax --pose pose.json --base-from-camera hand_eye.json --table 0.0 --gripper robotiq --top-down \\
+      -o grasps.yaml                                                             isaac_grasp
   ipjax grasp mug.ipjax --pose pose.json --gripper mine.json --format graspgen -o grasps.json
   ipjax grasp mug.ipjax --pose pose.json --by-box -o grasps.json                 by the object's box, as the paper
   ipjax grasp mug.ipjax --pose pose.json --write-gripper mine.json               a file of a gripper to begin with
@@ -69,7 +70,12 @@ def add(commands: Any) -> None:
     parser.add_argument("--rgb", type=Path, metavar="FILE", help="colour image of the frame, for --overlay")
     parser.add_argument("--by-box", action="store_true", help="by the object's box, as the paper, not its surface")
     parser.add_argument("--top-down", action="store_true", help="only approaches within 15 degrees of straight down")
-    parser.add_argument("--tilt", type=float, metavar="DEGREES", help="only approaches within this of straight down")
+    parser.add_argument(
+        "--tilt",
+        type=float,
+        metavar="DEGREES",
+        help="only approaches within this of straight down (without --table: of the camera's view)",
+    )
     options.add_changes(parser, "GraspConfig", "grasps=8")
     options.add_seed(parser)
     options.add_output(parser, "FILE", "where the grasps go: .json or .yaml (default: the best on the screen)")
@@ -125,6 +131,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     where = arguments.base_from_camera
     base_from_camera = None if where is None else read_rigid(where, "base_from_camera").to_jax()
     rgb, camera, workspace = _read_workspace(arguments, base_from_camera)
+    if workspace.table is not None:
+        _check_table(np.asarray(workspace.table, np.float64), estimate, info.name, messages)
     messages.print_notes()
     use_compilation_cache()
     plan = jax.jit(box_grasps if arguments.by_box else plan_grasps)
@@ -193,9 +201,20 @@ def _check(arguments: argparse.Namespace) -> str:
         raise ValueError("--table: the plane's normal has no length")
     if arguments.top_down and arguments.tilt is not None:
         raise ValueError("--top-down is --tilt 15: give one of them")
+    if arguments.top_down and arguments.table is None:
+        raise ValueError("--top-down needs --table, which tells where down is")
     if arguments.tilt is not None and not 0 < arguments.tilt <= 180:
         raise ValueError(f"--tilt is an angle from 0 to 180 degrees, not {arguments.tilt:g}")
     options.check_seed(arguments.seed)
+    given = [
+        arguments.object,
+        arguments.gripper,
+        arguments.pose,
+        arguments.base_from_camera,
+        arguments.depth,
+        arguments.camera,
+    ]
+    options.check_apart([arguments.output, arguments.overlay, arguments.write_gripper], [*given, arguments.rgb])
     return kind
 
 
@@ -223,9 +242,13 @@ def _read_workspace(arguments: argparse.Namespace, base_from_camera: Any) -> tup
 
         camera = read_camera(parse_camera(arguments.camera), arguments.image)
     if arguments.rgb is not None:
+        from ipjax.files.cameras.reading import as_intrinsics
         from ipjax.files.images.opening import read_rgb
+        from ipjax.inference.images import check_images
 
         rgb = read_rgb(arguments.rgb)
+        if camera is not None:
+            check_images(rgb, np.zeros(rgb.shape[:2], np.uint8), as_intrinsics(camera))
     if arguments.table is not None:
         if len(arguments.table) == 1:
             table = table_in_camera(arguments.table[0], base_from_camera)
@@ -240,6 +263,19 @@ def _read_workspace(arguments: argparse.Namespace, base_from_camera: Any) -> tup
         scene = read_scene(picture, measured, camera, arguments.depth_scale)
         depth, lens = jnp.asarray(scene.depth), Camera.from_matrix(scene.matrix)
     return rgb, camera, Workspace(table=table, depth=depth, camera=lens)
+
+
+def _check_table(table: Any, estimate: Any, name: str, messages: Messages) -> None:
+    """What a camera sees lies on the side of the table where the camera is."""
+    normal, offset = table[:3], float(table[3])
+    if offset > 0:
+        raise ValueError(
+            f"the camera is {offset:.2f} m below the table: is base_from_camera inverted, or the plane's normal the "
+            "wrong way round?"
+        )
+    height = float(normal @ estimate.camera_from_object.translation) - offset
+    if height < 0:
+        messages.keep(f"the middle of {name} is {-1e3 * height:.0f} mm below the table", is_warning=True)
 
 
 def _write_list(path: Path, kind: str, grasps: Any, gripper: Any, estimate: Any, info: Any) -> None:

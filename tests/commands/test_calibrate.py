@@ -105,6 +105,7 @@ def test_a_wrong_pair_is_named_and_a_shifted_one_refused(made, capfd):
         ({"board": "charuco:6x4:0.05:0.035:DICT_6X6_50"}, "markers of DICT_4X4_50 are seen there"),
         ({"robot_poses": "none.json"}, "none.json: no such file of robot poses"),
         ({"output": "none/answer.json"}, "the folder none does not exist"),
+        ({"output": "poses.json", "robot_poses": "poses.json"}, "poses.json: it is read and would be overwritten"),
         ({"output": "answer.yaml"}, "must end in .json"),
         ({"rotation": "best"}, "rotations are written as xyzw"),
     ],

@@ -103,6 +103,15 @@ def test_the_papers_grasps_and_none(folder, capfd):
         ({"--base-from-camera": None}, "--table Z is a height in the robot's base"),
         ({"--table": "0,0"}, "is no table: give its height in metres, or a plane"),
         ({"--table": "0,0,0,1"}, "the plane's normal has no length"),
+        ({"--table": "0,0,1,0.85"}, "the camera is 0.85 m below the table"),
+        ({"--table": None, "--top-down": None}, "--top-down needs --table, which tells where down is"),
+        (
+            {"--overlay": "out.png", "--rgb": "rgb.png", "--camera": "large.json"},
+            "images of 640 × 480, but rgb is 320 × 240",
+        ),
+        ({"-o": "pose.json"}, "pose.json: it is read and would be overwritten"),
+        ({"--overlay": "rgb.png", "--rgb": "rgb.png", "--camera": "camera.json"}, "it is read and would be"),
+        ({"-o": "two.json", "--write-gripper": "two.json"}, "two results cannot be written to one file"),
         ({"--tilt": "200"}, "--tilt is an angle from 0 to 180"),
         ({"--overlay": "out.png"}, "--overlay needs the image, --rgb, and its --camera"),
         ({"--depth": "depth.png"}, "--depth needs its --camera"),
@@ -113,8 +122,10 @@ def test_the_papers_grasps_and_none(folder, capfd):
 )
 def test_what_is_wrong_is_said_in_one_line(folder, change, said, capfd):
     given = {"--pose": "pose.json", "--base-from-camera": "hand_eye.json", "--table": "0"} | change
-    files = ("--pose", "--base-from-camera", "--overlay", "--depth", "-o")
-    line = ["grasp", str(folder / "box.ipjax")]
+    files = ("--pose", "--base-from-camera", "--overlay", "--rgb", "--depth", "-o")
+    line = ["grasp", str(folder / "box.ipjax")] + ["--top-down"] * ("--top-down" in change)
+    lens = json.loads((folder / "camera.json").read_text()) | {"width": 640, "height": 480}
+    (folder / "large.json").write_text(json.dumps(lens))
     for name, value in given.items():
         if value is not None:
             is_file = name in files or value.endswith(".json")
@@ -127,7 +138,12 @@ def test_what_is_wrong_is_said_in_one_line(folder, change, said, capfd):
 def test_a_pose_that_was_not_found_is_said(folder, capfd):
     document = json.loads((folder / "pose.json").read_text())
     entry = document["frames"][0]["objects"][0]
+    behind = np.array(entry["camera_from_object"]["matrix"])
+    behind[2, 3] *= -1
     for change, said in (
+        ({"camera_from_object": {"matrix": behind.tolist()}}, "mug is behind the camera there, at z = -0.8 m"),
+        ({"size_mm": entry["size_mm"] | {"diameter_std": float("nan")}}, "the estimate is not finite"),
+        ({"size_mm": entry["size_mm"] | {"diameter": 0}}, "a diameter of 0 mm ± 0.5 mm is none"),
         ({"success": False}, "no pose of mug was found"),
         ({"covariance": [1]}, "lacks something"),
         ({"object": "cup"}, "it has cup, not mug"),
@@ -137,3 +153,13 @@ def test_a_pose_that_was_not_found_is_said(folder, capfd):
         path.write_text(json.dumps(document))
         assert run(["grasp", str(folder / "box.ipjax"), "--pose", str(path)]) == 2
         assert said in capfd.readouterr().err
+    for frames, said in (([{"objects": None}], "it has no object"), ([{}, {}], "2 frames: say which with --frame")):
+        path.write_text(json.dumps({"frames": frames}))
+        assert run(["grasp", str(folder / "box.ipjax"), "--pose", str(path)]) == 2
+        assert said in capfd.readouterr().err
+
+
+def test_what_lies_below_the_table_is_told(folder, capfd):
+    assert run([*words(folder, "--by-box")[:-2], "0.2", "--by-box"]) == 1
+    told = capfd.readouterr()
+    assert "the middle of mug is 150 mm below the table" in told.err and "no grasp" in told.out

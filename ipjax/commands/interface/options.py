@@ -2,6 +2,7 @@
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,20 @@ def check_output(path: Path, suffixes: tuple[str, ...]) -> Path:
     if not os.access(path.parent, os.W_OK):
         raise ValueError(f"{path}: the folder {path.parent} cannot be written to")
     return path
+
+
+def check_apart(outputs: Sequence[Path | None], inputs: Sequence[Path | str | None]) -> None:
+    """Refuse to write over a file that is read, or two results into one file; ValueError says which."""
+    read = {Path(one).resolve() for one in inputs if one is not None}
+    written: set[Path] = set()
+    for path in outputs:
+        if path is None:
+            continue
+        if path.resolve() in read:
+            raise ValueError(f"{path}: it is read and would be overwritten; write to another file")
+        if path.resolve() in written:
+            raise ValueError(f"{path}: two results cannot be written to one file")
+        written.add(path.resolve())
 
 
 def check_folder(path: Path) -> Path:
