@@ -103,7 +103,7 @@ def solve(
     """The camera's mount by least squares on the views that are counted; the others only get their residual.
 
     Args:
-      views: three or more, whose robot poses turn about two axes or more (see `conditioning.check_motion`).
+      views: three or more, whose robot poses turn about two axes or more (see `motion.check_motion`).
       eye: where the camera is.
       begin: ``mount_from_camera`` and ``holder_from_board``; the closed form where it is not given.
       noise: of one view, of the camera or, where the views have covariances, of the robot; None = it is estimated.
