@@ -50,11 +50,10 @@ class Views:
     def __len__(self) -> int:
         return len(self.camera_from_board.scale)
 
-    def take(self, images: Int[np.ndarray, " k"], poses: Int[np.ndarray, " k"] | None = None) -> "Views":
-        """Some of the images, with the robot's poses of the same numbers or of others."""
+    def take(self, images: Int[np.ndarray, " k"]) -> "Views":
+        """Some of the images, with their robot poses."""
         covariance = None if self.covariance is None else self.covariance[images]
-        robot = self.base_from_gripper.take(images if poses is None else poses)
-        return Views(robot, self.camera_from_board.take(images), covariance)
+        return Views(self.base_from_gripper.take(images), self.camera_from_board.take(images), covariance)
 
 
 @dataclasses.dataclass(frozen=True)
