@@ -1,10 +1,13 @@
-"""``python -m benchmarks.grasps DATA``: picks of scanned objects in the simulated robot cell, with the true pose.
+"""``python -m benchmarks.grasps DATA``: picks of scanned objects in the simulated robot cell.
 
 Objects of a data set in BOP layout (YCB-V's, with their real masses) are let go on the table at random; grasps are
-planned from the true pose, and the first that the arm can do is done. Two studies:
+planned from the true pose, and the first that the arm can do is done. Studies:
 
 * ``true``: every object, 20 placements, both planners: planned, possible for the arm, succeeded.
 * ``physics``: the same few placements with other physics: what holds and what does not.
+* ``knowledge``: poses by ipjax from the cell's camera, the object known from a scan, poorer meshes, or a photo
+  (`benchmarks.grasp_knowledge`); needs the encoder's weights. `python -m benchmarks.grasp_rule` learns from others
+  when to grasp; the page has both.
 
 Each pick is a line of a journal in ``--output``: killed and called again, it goes on. ``--page`` writes the page of
 what is there.
@@ -56,6 +59,8 @@ PHYSICS = {
     "MuJoCo's default: pyramidal cone, impratio 1": PhysicsConfig(elliptic=False, impratio=1.0, noslip=0),
     "Menagerie's gripper as shipped: 4 N on the tendon": PhysicsConfig(force=2.0),
 }
+STUDIES = ("true", "physics")
+TRIALS = 6  # placements of each object in the study with poses by ipjax
 PLACEMENTS = 8  # of the study of physics
 HEAVY = (5, 15)  # its objects
 
@@ -122,7 +127,7 @@ def read_journal(path: Path) -> list[dict[str, Any]]:
 
 def write_page(path: Path, lines: dict[str, list[dict[str, Any]]]) -> None:
     """Tables of both studies."""
-    every = [line for study in lines.values() for line in study]
+    every = [line for study in STUDIES for line in lines.get(study, [])]
     commits = ", ".join(sorted({line["commit"] for line in every}))
     device = describe_device()
     arms = ", ".join(sorted({line["arm"] for line in every}))
@@ -139,9 +144,14 @@ def write_page(path: Path, lines: dict[str, list[dict[str, Any]]]) -> None:
         "",
     ]
     text += _table_true(lines.get("true", [])) + _table_physics(lines.get("physics", []))
+    if lines.get("knowledge"):
+        from benchmarks.grasp_knowledge import write_section
+        from benchmarks.grasp_rule import report
+
+        text += write_section(lines["knowledge"]) + report(lines["knowledge"], lines["drawn"])
     failed = [line for line in lines.get("true", []) if line["possible"] and not line["success"]]
     if failed:
-        text += ["## Every failure of a possible grasp with the physics as it is", ""]
+        text += ["## Every failure of a possible grasp with the true pose", ""]
         text += [f"* {line['name']}, seed {line['seed']}, {line['planner']}: {line['why']}" for line in failed] + [""]
     write_text(path, "\n".join(text))
 
@@ -207,11 +217,30 @@ def _table_physics(lines: list[dict[str, Any]]) -> list[str]:
     return [*text, ""]
 
 
+def run_by_pose(arguments: argparse.Namespace, dataset: Dataset, here: str) -> None:
+    """The study with poses by ipjax, as far as it is not done."""
+    from benchmarks.grasp_knowledge import KNOWLEDGE, Study, list_scanned
+    from ipjax.files.weights.encoder import load_encoder
+
+    study = Study(load_encoder(arguments.weights), arguments.output / "objects")
+    path = arguments.output / "knowledge.jsonl"
+    done = {(x["number"], x["seed"], x["knowledge"]) for x in read_journal(path)}
+    subjects = list_scanned(dataset, arguments.objects, arguments.only)
+    jobs = [(one, 70_000 + 100 * one.number + n) for n in range(TRIALS) for one in subjects]
+    for subject, seed in bar(jobs, desc="knowledge", unit=" placements"):
+        left = tuple(w for w in arguments.ways or KNOWLEDGE if (subject.number, seed, w) not in done)
+        for line in study.run(subject, seed, left) if left else ():
+            append_json(path, line | {"commit": here})
+
+
 def main() -> None:
     """Do what is not done yet, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path, metavar="FOLDER", help="YCB-V in BOP layout")
-    parser.add_argument("--studies", nargs="+", choices=("true", "physics"), default=["true", "physics"])
+    parser.add_argument("--studies", nargs="+", choices=(*STUDIES, "knowledge"), default=list(STUDIES))
+    parser.add_argument("--objects", type=Path, metavar="FOLDER", help="of scans onboarded already, obj_000001.ipjax")
+    parser.add_argument("--ways", nargs="+", metavar="WAY", help="in which objects are known: scan, level3, rgbd, …")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="of the encoder, for poses by ipjax")
     parser.add_argument("--only", type=int, nargs="+", metavar="ID", help="objects")
     parser.add_argument("--placements", type=int, default=20, metavar="N", help="of the study with the true pose")
     parser.add_argument("--arm", default="auto", help="auto, panda or gantry")
@@ -221,7 +250,9 @@ def main() -> None:
     use_compilation_cache()
     arguments.output.mkdir(parents=True, exist_ok=True)
     bench, here = Bench(Dataset(arguments.dataset)), commit()
-    for study in arguments.studies:
+    if "knowledge" in arguments.studies:
+        run_by_pose(arguments, bench.dataset, here)
+    for study in (name for name in STUDIES if name in arguments.studies):
         path = arguments.output / f"{study}.jsonl"
         done = {(x["obj_id"], x["seed"], x["planner"], x["physics"]) for x in read_journal(path)}
         jobs = [job for job in list_jobs(study, arguments.only, arguments.placements) if job not in done]
@@ -230,7 +261,8 @@ def main() -> None:
             line = bench.run(obj_id, seed, planner, arguments.arm, PHYSICS[physics])
             append_json(path, about | line | {"commit": here})
     if arguments.page is not None:
-        write_page(arguments.page, {s: read_journal(arguments.output / f"{s}.jsonl") for s in ("true", "physics")})
+        names = (*STUDIES, "knowledge", "drawn")
+        write_page(arguments.page, {s: read_journal(arguments.output / f"{s}.jsonl") for s in names})
 
 
 if __name__ == "__main__":

@@ -89,7 +89,15 @@ PAGES = (
         benchmarks.table {results}/cpu_2_cores.json {results}/query_cpu_2_cores.json --into README.md
         """,
     ),
-    Page("grasps", "benchmarks.grasps {data}/ycbv -o {out}/grasps --page {results}/grasps.md", ("ycbv",)),
+    Page(
+        "grasps",
+        """
+        benchmarks.grasps {data}/ycbv --studies true physics knowledge {weights} -o {out}/grasps
+        benchmarks.grasp_rule {out}/grasps
+        benchmarks.grasps {data}/ycbv -o {out}/grasps --page {results}/grasps.md
+        """,
+        ("ycbv",),
+    ),
     Page("grasp_planning", "benchmarks.grasp_planning -o {results}/grasp_planning.md"),
     Page("labelling_costs", "benchmarks.labelling_costs --page {results}/labelling_costs.md"),
     Page("compiling", "benchmarks.compiling --page {results}/compiling.md"),

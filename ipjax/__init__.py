@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         AlignConfig,
         ConfidenceConfig,
         Config,
+        DecisionConfig,
         DescribeConfig,
         DetectConfig,
         GraspConfig,
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from ipjax.onboarding.photo import onboard_photo
     from ipjax.onboarding.photographed import onboard_with_photo
     from ipjax.records import Camera, Patches, PoseEstimate, Query, ReferenceView, Surface, Templates, View
+    from ipjax.robot.grasps.decision import Decision, decide
     from ipjax.robot.grasps.planning import box_grasps, plan_grasps
     from ipjax.robot.grippers import read_gripper, write_gripper
     from ipjax.robot.records import Grasps, Gripper, Workspace, place_grasps
@@ -67,6 +69,8 @@ __all__ = [
     "ConfidenceConfig",
     "Config",
     "Dataset",
+    "Decision",
+    "DecisionConfig",
     "DescribeConfig",
     "DetectConfig",
     "Detection",
@@ -98,6 +102,7 @@ __all__ = [
     "Workspace",
     "box_grasps",
     "compact",
+    "decide",
     "degrade",
     "describe",
     "draw",
@@ -146,6 +151,7 @@ _HOMES = {
         "AlignConfig",
         "ConfidenceConfig",
         "Config",
+        "DecisionConfig",
         "DescribeConfig",
         "DetectConfig",
         "GraspConfig",
@@ -208,6 +214,7 @@ _HOMES = {
         "Templates",
         "View",
     ),
+    "robot.grasps.decision": ("Decision", "decide"),
     "robot.grasps.planning": (
         "box_grasps",
         "plan_grasps",

@@ -247,6 +247,19 @@ class GraspConfig(eqx.Module):
     apart: tuple[float, float] = (0.01, 0.26)  # m and rad: grasps closer than both are one
 
 
+class DecisionConfig(eqx.Module):
+    """When a planned grasp is tried (`ipjax.robot.grasps.decision`); made by ``python -m benchmarks.grasp_rule``."""
+
+    # The logarithm of the odds of success of a grasp: a constant, and what is added for each feature (`FEATURES`).
+    weights: tuple[float, ...] = (-2.806, 1.743, 0.076, 0.0, 2.597, -0.591)
+    grasp: float = 0.5  # least probability of success at which it is tried: more likely than not
+    least_elevation: float = 0.4  # rad above the table, from which another look may be had
+    most_elevation: float = 1.4  # rad
+    away: float = 0.35  # rad: least turn about the object from the present view to another look
+    reach: float = 0.85  # m from the robot's base, farther than which it holds no camera
+    rough: float = 0.25  # of the variance that a look does not lower: how much of what is guessed it leaves
+
+
 PRESETS = ("default", "fast", "paper")
 
 

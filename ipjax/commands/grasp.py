@@ -32,6 +32,9 @@ NX,NY,NZ,D in the camera's frame, n · x = D with n away from the table. Without
 camera's view. With --depth, a hand just behind something that was measured hits it; farther behind it may be free or
 not, and such a grasp has a lower score.
 
+The last line, and "decision" of the JSON, say whether to grasp: "grasp", "look again from here", with a place for the
+camera, or "do not", by the probability that the best grasp succeeds.
+
 Files by their ending: .json is ours, with every frame named, .yaml isaac_grasp of NVIDIA's Isaac, whose frame is the
 mesh's, in metres; --format graspgen is GraspGen's JSON, in which every gripper closes along x.
 """
@@ -121,6 +124,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.inference.reports import to_json
     from ipjax.robot.files.estimates import read_estimate
     from ipjax.robot.files.plans import grasps_as_json
+    from ipjax.robot.grasps.decision import decide
     from ipjax.robot.grasps.planning import box_grasps, plan_grasps
 
     config = _read_config(arguments)
@@ -155,7 +159,9 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         "seed": arguments.seed,
     }
     found = document["grasps"]
-    for line in _summary(info.name, found):
+    decision = decide(gripper, grasps, estimate, base_from_camera, known=templates, table=workspace.table)
+    document["decision"] = decision.as_json()
+    for line in (*_summary(info.name, found), decision.describe()):
         messages.say(line)
     if arguments.output is not None:
         if kind == "ipjax":

@@ -148,6 +148,7 @@ class Outcome:
     result: Any  # `ipjax.inference.estimator.Result`; None where the true pose was taken
     found: Any  # the estimate; None where there is none
     trial: Any
+    decision: Any  # whether to grasp, made before the pick; None where the true pose was taken
     error: Any  # PoseError; None where it cannot be told
     seconds: dict[str, float]
 
@@ -231,6 +232,7 @@ def _find_and_pick(
     from ipjax.files.meshes.sampling import sample_surface
     from ipjax.records import Surface
     from ipjax.robot.cell.trial import compare_poses, true_pose, try_pick
+    from ipjax.robot.grasps.decision import decide
     from ipjax.transforms import Similarity
 
     start = time.perf_counter()
@@ -260,7 +262,11 @@ def _find_and_pick(
         )
     trial = try_pick(cell, what, sight, estimate, seed=arguments.seed, by_box=arguments.by_box)
     messages.note(f"{trial.planned} grasps planned in {trial.seconds['plan']:.1f} s")
-    return Outcome(known, cell, sight, result, estimate, trial, error, seconds | trial.seconds)
+    decision = None
+    if result is not None:
+        decision = decide(cell.gripper, trial.grasps, estimate, sight.base_from_camera.to_jax(), known=what)
+        messages.note(decision.describe())
+    return Outcome(known, cell, sight, result, estimate, trial, decision, error, seconds | trial.seconds)
 
 
 def _diameter(mesh: Any) -> float:
@@ -329,6 +335,7 @@ def _write(outcome: Outcome, arguments: argparse.Namespace, messages: Messages, 
         "pose_error": None if outcome.error is None else outcome.error.as_json(),
         "grasps_by": "box" if arguments.by_box else "surface",
         "planned": trial.planned,
+        "decision": None if outcome.decision is None else outcome.decision.as_json(),
         "possible": trial.pick.possible,
         "pick": trial.pick.as_json(),
         "film": None if film_file is None else film_file.name,
@@ -404,6 +411,8 @@ def _list_facts(document: dict[str, Any]) -> list[tuple[str, str]]:
         off = f"{error['rotation_deg']:.1f}°, {error['centre_mm']:.1f} mm, {error['size_error']:+.1%} in size"
         facts.append(("pose is off by", off))
     facts.append(("grasps planned", f"{document['planned']}, by the object's {document['grasps_by']}"))
+    if document["decision"] is not None:
+        facts.append(("before the pick", f"{document['decision']['action']}: {document['decision']['why']}"))
     if document["possible"]:
         facts += [
             ("grasp done", f"number {pick['grasp'] + 1}; {len(pick['refused'])} before it the arm cannot do"),

@@ -41,6 +41,9 @@ def test_grasps_in_every_frame_and_a_picture(folder, capfd):
     best = told["grasps"][0]
     assert best["width_m"] == pytest.approx(0.06, abs=2e-4) and 0 < best["score"] <= 1 and best["safe"] > 0.9
     assert best["spare_m"] == pytest.approx(0.01, abs=2e-4)
+    decision = told["decision"]
+    assert decision["action"] == "grasp" and 0.5 <= decision["probability"] < 1, "a sure pose of a box"
+    assert told["grasps"][decision["grasp"]]["safe"] > 0.9 and decision["base_from_view"] is None
     frames = {name: np.array(best[f"{name}_from_gripper"]) for name in ("object", "camera", "base", "mesh")}
     for name, pose in frames.items():
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-5, err_msg=name)

@@ -31,6 +31,7 @@ def test_a_pick_is_told_and_shown(block, tmp_path, capfd):
     told = json.loads(printed)
     assert json.loads((out / "result.json").read_text()) == told
     assert told["pick"]["success"] and told["possible"] and told["planned"] > 0 and told["pose"] is None
+    assert told["decision"] is None, "nothing is uncertain about the true pose"
     assert (told["arm"], told["gripper"], told["mass_kg"], told["film"]) == ("gantry", "franka", 0.3, None)
     page = (out / "simulation.html").read_text()
     assert "Success: lifted by" in page and page.count("<img") == 3 and "300 g" in page

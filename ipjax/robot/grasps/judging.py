@@ -15,11 +15,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ipjax.config import GraspConfig
 from ipjax.metrics.poses import turn_angle
-from ipjax.records import PoseEstimate
+from ipjax.records import PoseEstimate, Surface, Templates
+from ipjax.robot.grasps.hands import closing_from_gripper, make_hand
 from ipjax.robot.grasps.obstacles import above_table, compare_with_depth, look_past, table_in_object
-from ipjax.robot.grasps.solid import Solid, pose_of
+from ipjax.robot.grasps.solid import Solid, make_solid, pose_of
 from ipjax.robot.grasps.uncertainty import deviation_along, sample_poses
-from ipjax.robot.records import Workspace, rigid
+from ipjax.robot.records import Gripper, Workspace, rigid
 from ipjax.transforms import Similarity
 
 _HIDDEN = 0.1  # share of the hand's way that is out of sight, above which more is no worse
@@ -144,6 +145,36 @@ def share_safe(
     touch = _close(solid, hand, flat.inverse(), config, centred=False)
     holds = _holds(touch, solid, hand, config).reshape(count, config.poses)
     return jnp.mean(holds.astype(object_from_closing.translation.dtype), axis=-1)
+
+
+def check_grasps(
+    gripper: Gripper,
+    surface: Templates | Surface,
+    camera_from_object: Similarity,
+    camera_from_gripper: Similarity,
+    config: GraspConfig = GraspConfig(),
+) -> Bool[Array, " g"]:
+    """Whether hands hold an object whose pose is known: nothing is hit on the straight way, both pads press.
+
+    What the planner asks of the pose it was given, asked of another: the true one tells what a planned grasp was worth
+    without a simulation. Table and measured depth are not asked.
+
+    Args:
+      surface: of the object, in the units of its pose.
+      camera_from_object: metres per model unit.
+      camera_from_gripper: rigid, leading axis g.
+    """
+    solid = make_solid(surface, camera_from_object)
+    hand = make_hand(gripper, solid.points.dtype)
+    pose = rigid(camera_from_object)
+    object_from_camera = Similarity(*(x[None] for x in _parts(pose.inverse())))
+    poses = object_from_camera @ camera_from_gripper
+    turn = jnp.asarray(closing_from_gripper(gripper.closing).T, poses.rotation.dtype)
+    rotation = jnp.matmul(poses.rotation, turn, precision="highest")
+    touch = _close(
+        solid, hand, Similarity(rotation, poses.translation, jnp.ones_like(poses.scale)), config, centred=False
+    )
+    return _holds(touch, solid, hand, config)
 
 
 def _close(solid: Solid, hand: Hand, object_from_closing: Similarity, config: GraspConfig, *, centred: bool) -> Touch:
