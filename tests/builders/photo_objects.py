@@ -7,6 +7,7 @@ import functools
 
 import jax
 import numpy as np
+from builders.compilation import QUICKLY
 
 import ipjax
 from ipjax.config import Config, OnboardConfig, ResectConfig
@@ -20,7 +21,7 @@ from ipjax.transforms import Similarity, rotation_from_vector
 CONFIG = Config(resect=ResectConfig(views=6, count=256))
 ONBOARD = OnboardConfig(directions=1, rolls=1, resolution=112, surface=512, appearance=0)
 encoder = problems.make_encoder()
-estimate = jax.jit(ipjax.estimate)
+estimate = jax.jit(ipjax.estimate, compiler_options=QUICKLY)
 look = jax.jit(observe)
 
 

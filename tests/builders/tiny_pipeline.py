@@ -1,10 +1,12 @@
 """The smallest settings that estimate, compiled once for all tests, with objects and queries for them."""
 
 import dataclasses
+import functools
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from builders.compilation import QUICKLY
 
 import ipjax
 from benchmarks.bias import rotation_error
@@ -23,7 +25,7 @@ DRAWN = dataclasses.replace(TINY, score=ScoreConfig(resolution=28, alternates=0,
 TRACES = []
 
 
-@jax.jit
+@functools.partial(jax.jit, compiler_options=QUICKLY)
 def estimate(templates, query, key, config, diameter=None):
     """Compiled once for each of the configurations above, not once per test."""
     TRACES.append(config)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.compilation import QUICKLY
 from builders.tiny_pipeline import DRAWN, TINY, TRACES, TURNED, assert_near, estimate, make_sized_query, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -49,7 +50,7 @@ def test_recovers_pose_and_size(templates, seed):
 
 @pytest.mark.skipif(jax.__version_info__ >= (0, 11), reason="this JAX has one kind of emitters, the tests' and users'")
 def test_the_default_compilation_has_the_same_answer(templates):
-    """Tests compile with XLA's older emitters on a CPU (see conftest.py), users with its default ones."""
+    """Tests compile without optimisation and with XLA's older emitters on a CPU (see conftest.py), users with both."""
     default = jax.jit(
         lambda *records: ipjax.estimate(None, *records, jax.random.key(0), TINY),
         compiler_options={"xla_cpu_use_fusion_emitters": True},
@@ -265,9 +266,9 @@ def test_vmap_over_padded_objects_queries_and_diameters_equals_the_loop():
     queries = [make_sized_query(seed, size)[0] for seed, size in zip((11, 12), (0.12, 0.09), strict=True)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *queries)
     keys = jax.random.split(jax.random.key(3), 2)
-    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, 0, None, 0)))
+    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, 0, None, 0)), compiler_options=QUICKLY)
     together = together(encoder, padded, stacked, keys, DRAWN, diameters)
-    alone = jax.jit(ipjax.estimate)
+    alone = jax.jit(ipjax.estimate, compiler_options=QUICKLY)
     for index, one in enumerate(objects):
         wanted = alone(encoder, one, queries[index], keys[index], DRAWN, diameters[index])
         found = jax.tree.map(lambda x, index=index: x[index], together)
@@ -304,7 +305,7 @@ def test_with_the_encoder_candidates_are_drawn(templates):
     encoder = problems.make_encoder()
     known = dataclasses.replace(templates, appearance=problems.make_appearance(20_000))
     config = dataclasses.replace(TURNED, score=ScoreConfig(resolution=28, alternates=1, drawn=3))
-    run = jax.jit(ipjax.estimate)
+    run = jax.jit(ipjax.estimate, compiler_options=QUICKLY)
     for seed in range(4):
         query, truth = problems.make_query(seed, noise=0.3)
         found = run(encoder, known, query, jax.random.key(0), config)
@@ -312,7 +313,7 @@ def test_with_the_encoder_candidates_are_drawn(templates):
         assert bool(jnp.all(jnp.diff(found.hypotheses.score) <= 0))
         relative = np.asarray(found.camera_from_object.rotation).T @ np.asarray(truth.rotation)
         assert np.degrees(np.arccos(np.clip((np.trace(relative) - 1) / 2, -1, 1))) < 15
-    plain = run(encoder, templates, query, jax.random.key(0), config)
+    plain = jax.eval_shape(run, encoder, templates, query, jax.random.key(0), config)
     assert plain.hypotheses.score.shape[0] > 3  # without an appearance nothing can be drawn
 
 

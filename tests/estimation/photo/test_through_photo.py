@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from builders.compilation import QUICKLY
 from builders.photo_objects import CONFIG, encoder, estimate, known, photograph, see
 
 import ipjax
@@ -185,7 +186,7 @@ def test_vmap_over_padded_objects_queries_and_diameters_equals_the_loop():
     fewer = ipjax.compact(fewer, multiple=8)
     objects, queries, sizes = (first, fewer), (one, other), jnp.array([0.2, 0.15])
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *queries)
-    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, None, None, 0)))
+    together = jax.jit(jax.vmap(ipjax.estimate, (None, 0, 0, None, None, 0)), compiler_options=QUICKLY)
     together = together(encoder, ipjax.pad_templates(objects), stacked, jax.random.key(0), CONFIG, sizes)
     for index in range(2):
         wanted = run(objects[index], queries[index], sizes[index])
