@@ -98,6 +98,7 @@ PAGES = (
         """,
         ("ycbv",),
     ),
+    Page("hand_eye", "benchmarks.hand_eye --page {results}/hand_eye.md"),
     Page("grasp_planning", "benchmarks.grasp_planning -o {results}/grasp_planning.md"),
     Page("labelling_costs", "benchmarks.labelling_costs --page {results}/labelling_costs.md"),
     Page("compiling", "benchmarks.compiling --page {results}/compiling.md"),
