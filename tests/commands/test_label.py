@@ -152,9 +152,54 @@ def test_labels_of_something_else_are_not_continued(words, tmp_path, capsys):
         (["--obj-id", "4"], "once for each object"),
         (["--obj-id", "4", "--obj-id", "4"], "numbers of their own"),
         (["--objects", "none.ipjax"], "none.ipjax: no such object file"),
+        (["--split", "../test"], "--split is the name of a folder"),
+        (["--split", ".."], "--split is the name of a folder"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(words, more, said, capsys):
     assert run(words("out", *more)) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and said in error, error
+
+
+def test_what_is_read_is_not_removed(words, tmp_path, capsys):
+    """Frames in a folder that is called as those of labels are: --restart removes labels, and nothing else."""
+    source = write_image_wise(tmp_path / "data" / "shards", make_frames(1))
+    given = words("data", "--restart")
+    given[1] = str(source)
+    assert run(given) == 2
+    assert "choose another -o" in capsys.readouterr().err and len(list(source.iterdir())) == 5
+    stranger = tmp_path / "out" / "work" / "letter.txt"
+    stranger.parent.mkdir(parents=True)
+    stranger.write_text("dear")
+    assert run(words("out", "--restart", "--shard", "1/2")) == 0
+    assert stranger.is_file(), "there were no labels to forget"
+
+
+def test_a_source_without_frames_is_refused(words, tmp_path, capsys):
+    scene = tmp_path / "bop" / "test" / "000001"
+    scene.mkdir(parents=True)
+    (scene / "scene_camera.json").write_text("{}")
+    given = words("out")
+    given[1] = str(tmp_path / "bop")
+    assert run(given) == 2
+    assert "bop: it has no frames" in capsys.readouterr().err
+
+
+def test_masks_in_a_folder_of_detections_are_used_and_told_apart(words, tmp_path, capsys):
+    folder = tmp_path / "cnos"
+    folder.mkdir()
+
+    def write(score):
+        mask = make_frames(1)[0].mask[None].astype(np.uint8)
+        about = {"scene_id": 0, "image_id": 0, "time": 0.1, "bbox": np.array([[0, 0, 9, 9]])}
+        np.savez(folder / "0.npz", **about, category_id=np.array([1]), score=np.array([score]), segmentation=mask)
+
+    write(0.9)
+    detections = ("--detections", str(folder), "--shard", "0/2", "--json")
+    assert run(words("out", *detections)) == 0
+    assert read_out(capsys)["frames"] == 4
+    assert len(read_results(tmp_path / "out" / "shards" / "000000" / "labels.csv")) == 1
+    write(0.8)
+    assert run(words("out", *detections)) == 2
+    assert "made with something else (detections.files)" in capsys.readouterr().err

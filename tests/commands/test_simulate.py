@@ -25,6 +25,8 @@ def block(tmp_path_factory):
 
 def test_a_pick_is_told_and_shown(block, tmp_path, capfd):
     out = tmp_path / "out"
+    out.mkdir()
+    (out / "film.mp4").write_bytes(b"of an earlier pick")
     words = ["simulate", "--mesh", block, "--true-pose", "--arm", "gantry", "--mass", 0.3, "--seed", 2, "--no-film"]
     assert run([*map(str, words), "-o", str(out), "--json"]) == 0
     printed = capfd.readouterr().out
@@ -33,6 +35,7 @@ def test_a_pick_is_told_and_shown(block, tmp_path, capfd):
     assert told["pick"]["success"] and told["possible"] and told["planned"] > 0 and told["pose"] is None
     assert told["decision"] is None, "nothing is uncertain about the true pose"
     assert (told["arm"], told["gripper"], told["mass_kg"], told["film"]) == ("gantry", "franka", 0.3, None)
+    assert not (out / "film.mp4").exists()
     page = (out / "simulation.html").read_text()
     assert "Success: lifted by" in page and page.count("<img") == 3 and "300 g" in page
     assert not re.search(r'(src|href)="(?!data:)', page)
@@ -58,6 +61,7 @@ def test_a_pick_is_told_and_shown(block, tmp_path, capfd):
         (("--true-pose", "--gripper", "claw"), "claw: neither franka, robotiq nor a file"),
         (("--true-pose", "--gripper", "robotiq", "--arm", "panda"), "has the Franka hand, not robotiq"),
         (("--true-pose", "--mesh", "none.ply"), "none.ply"),
+        (("--true-pose", "--unit", "mm"), "--unit is that of --mesh"),
         (("--true-pose", "--mesh", "BLOCK", "--unit", "mm"), "is its unit right"),
         (("--true-pose", "--detect"), "not allowed with"),
         (("OBJECT", "--true-pose"), "mug is 3.54 mm large"),

@@ -13,9 +13,10 @@ from builders import fake_labels
 from builders.fake_labels import hash_labels, make_worker, run, write_frames
 
 from ipjax.bop.results import read_results
+from ipjax.files.provenance import list_executed
 from ipjax.files.storage.locks import locked
 from ipjax.labelling.shards.ledger import Ledger
-from ipjax.labelling.shards.plan import WORK, plan_shards
+from ipjax.labelling.shards.plan import CODE, WORK, plan_shards
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -40,6 +41,11 @@ def test_a_plan_covers_every_frame_once():
     assert [s.start for s in plan[1:]] == [s.stop for s in plan[:-1]] and plan_shards(0, 5) == []
     with pytest.raises(ValueError, match="at least one frame"):
         plan_shards(3, 0)
+
+
+def test_code_that_reads_frames_is_part_of_what_labels_are_made_of():
+    executed = list_executed(*CODE)
+    assert {"ipjax.labelling.sources.tar_shards", "ipjax.labelling.sources.frame_folder"} <= executed.keys()
 
 
 def test_what_a_shard_holds(tmp_path, frames, whole):
@@ -158,6 +164,7 @@ def test_batches_after_a_crash_are_those_of_before(tmp_path):
     again.append([{"name": "4", "error": "still bad"}])
     again = Ledger(path, 7, 3)
     assert again.to_try_again() == [] and [one["error"] for one in again.collect()][4] == "still bad"
-    path.write_text("{}\n{not json\n")
-    with pytest.raises(ValueError, match=r"labels\.jsonl: damaged"):
-        Ledger(path, 2, 1)
+    for line in ("{not json", "5", "{}"):
+        path.write_text(f'{{"name": "0", "error": ""}}\n{line}\n')
+        with pytest.raises(ValueError, match=r"labels\.jsonl: damaged"):
+            Ledger(path, 2, 1)

@@ -88,6 +88,13 @@ def test_masks_of_a_folder_are_the_objects_in_their_order_or_as_scene_gt_says(tm
     assert masks_of([7, 8]) == [0, 1]
     (folder / "scene_gt.json").write_text(json.dumps({"0": [{"obj_id": 8}, {"obj_id": 7}, {"obj_id": 8}]}))
     assert masks_of([7, 8]) == [1, 0, 1]
+    before = open_source(folder, [7, 8]).identity()
+    (folder / "scene_gt_info.json").write_text(json.dumps({"0": [{"visib_fract": s} for s in (0.0, 1.0, 1.0)]}))
+    assert masks_of([7, 8]) == [0, 1]
+    assert open_source(folder, [7, 8]).identity() != before, "other masks are used: it is another source"
+    (folder / "scene_gt.json").write_text('{"0": [{"obj_id": 1e999}]}')
+    with pytest.raises(ValueError, match="no list of instances of 000000"):
+        masks_of([7, 8])
 
 
 def test_names_that_are_no_numbers_get_a_place(tmp_path):
@@ -199,9 +206,18 @@ def test_damaged_parts_are_named(tmp_path):
     source = open_source(folder, [1, 2])
     (key,) = source.keys()
     kept = {path.name: path.read_bytes() for path in folder.iterdir()}
-    for name, content in (("depth.png", b"x"), ("camera.json", b"[]"), ("gt.json", b"{"), ("mask_visib.json", b"{}")):
+    damages = (
+        ("depth.png", b"x"),
+        ("camera.json", b"[]"),
+        ("gt.json", b"{"),
+        ("gt.json", b'[{"obj_id": 1e999}]'),
+        ("gt.json", b'[{"obj_id": "mug"}]'),
+        ("mask_visib.json", b"{}"),
+        ("mask_visib.json", b'{"1": {"size": [10, 10], "counts": [100]}}'),
+    )
+    for name, content in damages:
         (folder / f"000000_000000.{name}").write_bytes(content)
-        with pytest.raises(ValueError, match=r"000000_000000(\.|:)"):
+        with pytest.raises(ValueError, match=r"000000_000000[.:,]"):
             source.read(key)
         (folder / f"000000_000000.{name}").write_bytes(kept[f"000000_000000.{name}"])
     assert source.read(key).masks

@@ -18,7 +18,7 @@ from ipjax.labelling.sources.records import SourceFrame
 
 _TEMPLATE = Path(__file__).with_name("page.html.jinja")
 _BINS = 20
-_LISTED = 40  # jumps, collisions and bad frames, each; coco.json and the table have all
+_LISTED = 40  # jumps, collisions and bad frames, each; quality.json and bad_frames.json have all
 _HEIGHT = 420  # of a picture, pixels
 
 

@@ -33,7 +33,7 @@ class Ledger:
         if len(kept) < len(lines):
             os.truncate(path, sum(len(line.encode()) + 1 for line in kept))
         try:
-            self.entries: list[Entry] = [parse_json(line) for line in kept]
+            self.entries: list[Entry] = [_parse(line) for line in kept]
         except ValueError as error:
             raise ValueError(f"{path}: damaged ({error}); remove it to label this shard again") from None
 
@@ -60,6 +60,13 @@ class Ledger:
         """The last entry of every frame, in the order of the frames."""
         again = {entry["name"]: entry for entry in self.entries[self.frames :]}
         return [again.get(entry["name"], entry) for entry in self.entries[: self.frames]]
+
+
+def _parse(line: str) -> Entry:
+    entry = parse_json(line)
+    if not isinstance(entry, dict) or not {"name", "error"} <= entry.keys():
+        raise ValueError("a line is no frame")
+    return entry
 
 
 def in_words(error: OSError, folder: Path) -> OSError:

@@ -17,13 +17,21 @@ from ipjax.files.storage.parsing import read_json
 from ipjax.files.storage.writing import write_text
 from ipjax.files.weights.hashes import hash_file
 from ipjax.labelling.records import LabelSettings
-from ipjax.labelling.sources.records import FrameKey, Source, SourceError, hash_keys
+from ipjax.labelling.sources.records import FrameKey, Source, SourceError, hash_keys, hash_plain
 
 FORMAT = "ipjax labels 1"
 MANIFEST = "manifest.json"
 SHARDS, WORK, LOGS = "shards", "work", "logs"  # folders: finished, begun, and what may differ from run to run
 # Of the settings those on which no answer depends but by rounding.
 _FREE = ("threads", "buckets")
+# What makes labels of frames, and what reads the frames.
+CODE = (
+    "ipjax.labelling.batch",
+    "ipjax.labelling.shards.working",
+    "ipjax.labelling.sources.opening",
+    "ipjax.labelling.sources.detections",
+)
+_NEEDED = ("objects", "frames", "shard_size", "shards")  # of a manifest, for merging
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,16 +82,16 @@ def make_manifest(
     Args:
         batch: frames that are labelled at a time.
         previews: every so many-th frame is drawn; 0 = none.
-        detections: a file of masks that were used.
+        detections: the file of masks that were used, or the folder of such.
     """
     plan = plan_shards(len(keys), shard_size)
     fields = {f.name: getattr(settings, f.name) for f in dataclasses.fields(settings) if f.name not in _FREE}
     made = {
         "format": FORMAT,
         "version": __version__,
-        "code": hash_executed("ipjax.labelling.batch", "ipjax.labelling.shards.working"),
+        "code": hash_executed(*CODE),
         "source": {"kind": source.kind, "path": str(source.path), **source.identity()},
-        "detections": None if detections is None else {"path": str(detections), "sha256": hash_file(detections)},
+        "detections": None if detections is None else {"path": str(detections), **_hash_detections(detections)},
         "encoder": str(getattr(encoder, "identity", "unnamed")),
         "objects": [
             {"number": one.number, "name": one.info.name, "path": str(one.path), "sha256": hash_file(one.path)}
@@ -125,11 +133,14 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of a folder of labels.
 
     Raises:
-        ValueError: there is none, or none of this format.
+        ValueError: there is none, or none of this format, or it is damaged.
     """
     manifest = read_json(folder / MANIFEST, "manifest of labels")
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ValueError(f"{folder / MANIFEST}: no manifest of the format {FORMAT!r}")
+    missing = [name for name in _NEEDED if name not in manifest]
+    if missing:
+        raise ValueError(f"{folder / MANIFEST}: damaged: it has no {missing[0]}")
     return manifest
 
 
@@ -139,6 +150,13 @@ def check_source(manifest: Mapping[str, Any], source: Source, keys: Sequence[Fra
     hashes = [hash_keys(keys[shard.start : shard.stop]) for shard in plan]
     if hashes != manifest["shards"]:
         raise SourceError(f"{source.path}: its frames are not those that were labelled")
+
+
+def _hash_detections(path: Path) -> dict[str, Any]:
+    """The content of a file of masks, or of every file of a folder of such."""
+    if not path.is_dir():
+        return {"sha256": hash_file(path)}
+    return {"files": hash_plain({file.name: hash_file(file) for file in path.glob("*.npz")})}
 
 
 def _essential(manifest: Mapping[str, Any]) -> dict[str, Any]:

@@ -59,7 +59,7 @@ class BopScenes:
 
     def identity(self) -> dict[str, Any]:
         """The cameras and, where masks are used, the annotations of every scene, by their content."""
-        names = ["scene_camera.json", *(["scene_gt.json"] if self.has_masks else [])]
+        names = ["scene_camera.json", *(["scene_gt.json", "scene_gt_info.json"] if self.has_masks else [])]
         folder = self.path / self.dataset.split
         files = {
             f"{scene:06d}/{name}": hash_file(folder / f"{scene:06d}" / name)[:16]

@@ -80,7 +80,7 @@ class FrameFolder:
         return SourceFrame(scene.rgb, scene.depth, scene.matrix, masks, path.relative_to(self.path).as_posix())
 
     def identity(self) -> dict[str, Any]:
-        """The names and sizes of the images, and the camera."""
+        """The names and sizes of the images, the camera, and the annotations that are used."""
         files = [*self.colours.values(), *self.depths.values()]
         if self.masks is not None:
             files += sorted(self.masks.iterdir())
@@ -88,8 +88,9 @@ class FrameFolder:
         is_file = isinstance(self.camera, str | Path) and Path(self.camera).is_file()
         camera = hash_file(Path(self.camera))[:16] if is_file else str(self.camera)
         about = {"masks": self.masks is not None, "files": hash_plain(sizes), "camera": camera}
-        if self.truth is not None:
-            about["scene_gt.json"] = hash_file(self.path / "scene_gt.json")[:16]
+        for name, document in (("scene_gt.json", self.truth), ("scene_gt_info.json", self.about)):
+            if document is not None:
+                about[name] = hash_file(self.path / name)[:16]
         return about | {"depth_scale": self.depth_scale}
 
     def _camera(self, key: FrameKey) -> Intrinsics:
@@ -112,7 +113,7 @@ class FrameFolder:
             image = str(int(key.name))
             items = [int(item["obj_id"]) for item in self.truth[image]]
             shares = [float(item.get("visib_fract", 1)) for item in self.about[image]] if self.about else [1.0]
-        except (AttributeError, KeyError, TypeError, ValueError):
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
             raise ValueError(f"{self.path / 'scene_gt.json'}: it has no list of instances of {key.name}") from None
         shares = shares if len(shares) == len(items) else [1.0] * len(items)
         return [

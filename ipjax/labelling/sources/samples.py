@@ -108,8 +108,10 @@ def _read_masks(
                 continue
             mask = decode_rle(runs[str(place)])
             if mask.shape != size:
-                raise ValueError(f"{where}.{MASKS}: a mask is {mask.shape[1]} × {mask.shape[0]} pixels")
+                raise ValueError(f"a mask is {mask.shape[1]} × {mask.shape[0]} pixels")
             found.append((list(numbers).index(number), mask))
     except (KeyError, TypeError, IndexError, AttributeError):
         raise ValueError(f"{where}: gt.json and {MASKS} must have an entry for each instance") from None
+    except (ValueError, OverflowError) as error:  # an infinite number is no integer
+        raise ValueError(f"{where}, gt.json or {MASKS}: {error}") from None
     return tuple(found)

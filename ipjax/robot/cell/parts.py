@@ -7,6 +7,7 @@ are made once, kept in the cache by the mesh's content, and compared with it by 
 import dataclasses
 import hashlib
 import logging
+import zipfile
 from collections.abc import Iterator
 from typing import Any
 
@@ -110,9 +111,9 @@ def _cached_parts(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, 
     path = cache_folder("parts") / f"{digest}.npz"
     if path.is_file():
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
                 return tuple(stored[key] for key in sorted(stored.files))
-        except (OSError, ValueError, KeyError):
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
             log.info("%s cannot be read, and is made again", path)
     corners = tuple(_decompose(vertices, faces))
     try:

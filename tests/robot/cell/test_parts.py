@@ -49,9 +49,11 @@ def test_a_hollow_mesh_is_several_parts_kept_by_content(cache, monkeypatch):
     again = make_parts(mesh)
     assert all((a == b).all() for a, b in zip(found.corners, again.corners, strict=True))
     (kept,) = cache.rglob("*.npz")
-    kept.write_bytes(b"broken")
-    with pytest.raises(AssertionError, match="made again"):
-        make_parts(mesh)
+    whole = kept.read_bytes()
+    for damaged in (b"broken", b"", whole[: len(whole) // 2]):
+        kept.write_bytes(damaged)
+        with pytest.raises(AssertionError, match="made again"):
+            make_parts(mesh)
 
 
 def test_parts_that_fill_the_hollow_are_told(monkeypatch):
