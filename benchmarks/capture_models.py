@@ -61,7 +61,7 @@ def measure_seed(seed: int, views: int, size: tuple[int, int], *, exact: bool, w
     spent["fuse"] = time.process_time() - start[0]
     touching = [[0, 1], [2, 3]][: 1 + seed % 2]
     found: dict[str, Any] = {"seed": seed, "touching": touching}
-    for way, hints in (("alone", []), ("clicks", click(made))):
+    for way, hints in (("alone", []), ("clicks", click(made, frames))):
         begin = time.process_time()
         models = make_objects(fused, frames, hints, config)
         spent[f"separate, {way}"] = time.process_time() - begin
@@ -89,13 +89,16 @@ def cpu_of_children() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def click(made: MadeCapture) -> list[Hint]:
-    """One click on every object, in its middle, in the frame that shows most of the object that it shows least of."""
-    counts = np.stack([(made.ids == k).sum((1, 2)) for k in range(len(made.meshes))])
+def click(made: MadeCapture, frames: Sequence[PosedFrame]) -> list[Hint]:
+    """One click on every object, in its middle where depth is known, in the frame that shows most of the object that it
+    shows least of.
+    """
+    ids = np.where(np.stack([frame.depth for frame in frames]) > 0, made.ids, -1)
+    counts = np.stack([(ids == k).sum((1, 2)) for k in range(len(made.meshes))])
     number = int(counts.min(0).argmax())
     hints = []
     for k in range(len(made.meshes)):
-        inner = cv2.distanceTransform((made.ids[number] == k).astype(np.uint8), cv2.DIST_L2, 5)
+        inner = cv2.distanceTransform((ids[number] == k).astype(np.uint8), cv2.DIST_L2, 5)
         y, x = np.unravel_index(inner.argmax(), inner.shape)
         hints.append(Hint(f"object {k}", made.names[number], float(x), float(y)))
     return hints
