@@ -38,11 +38,13 @@ def draw_mask(
     # Every point enlarged and the outline shrunk again: closed, and no larger than the points.
     wide = drawn(radius=radius)
     side = 2 * radius + 1
-    filled = lax.reduce_window((wide > 0).astype(jnp.float32), 1.0, lax.min, (side, side), (1, 1), "SAME") > 0.5
+    filled = (
+        lax.reduce_window((wide > 0).astype(jnp.float32), np.float32(1), lax.min, (side, side), (1, 1), "SAME") > 0.5
+    )
     # Where the surface is steep, depth changes by more than the tolerance from pixel to pixel: all that is drawn within
     # a pixel is its depth, but for what shows through gaps. Wide windows are only for those.
     near, exact = drawn(radius=1), drawn(radius=0)
-    far = lax.reduce_window(exact, 0.0, lax.max, (3, 3), (1, 1), "SAME")
+    far = lax.reduce_window(exact, np.zeros((), exact.dtype), lax.max, (3, 3), (1, 1), "SAME")
     near, far = jnp.where(near > 0, near, wide), jnp.where(near > 0, jnp.minimum(far, near + tolerance), wide)
     off = (depth > 0) & ((depth < near - tolerance) | (depth > far + tolerance))
     return filled, filled & ~off

@@ -35,3 +35,12 @@ def test_gaps_between_few_points_are_closed_also_where_they_are_padded():
     frame = make_frame(pose)
     plain, padded = (mask_from_pose(one, pose, MATRIX, frame.depth)[1] for one in (few, pad_alike([few, templates])[0]))
     assert overlap(plain, frame.masks[0]) > 0.85 and np.array_equal(padded, plain)
+
+
+def test_masks_in_double_precision_are_the_same(x64):
+    pose = place(0.0, 0.0)
+    frame = make_frame(pose)
+    wide = mask_from_pose(ellipsoid()[0], pose, MATRIX, frame.depth.astype(np.float64))
+    with jax.enable_x64(False):
+        narrow = mask_from_pose(ellipsoid()[0], pose, MATRIX, frame.depth)
+    assert wide[0].any() and overlap(wide[0], narrow[0]) > 0.99 and overlap(wide[1], narrow[1]) > 0.99
