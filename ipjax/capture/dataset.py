@@ -4,12 +4,12 @@ import contextlib
 import dataclasses
 from pathlib import Path
 
+from ipjax.capture.labels.dataset import check_dataset
 from ipjax.capture.poses.boards import parse_board
 from ipjax.capture.reading.opening import open_capture
 from ipjax.capture.records import Capture, CaptureError
 from ipjax.capture.report.page import write_report
 from ipjax.capture.steps.chain import STEPS
-from ipjax.capture.steps.labels import check_dataset
 from ipjax.capture.steps.records import Job
 from ipjax.capture.steps.running import Done, Listener, run_steps
 from ipjax.capture.steps.settings import RunSettings

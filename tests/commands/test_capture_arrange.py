@@ -84,6 +84,30 @@ def test_what_is_no_model_is_said_in_a_sentence(folder, tmp_path, capfd):
     ):
         assert run(["capture", "arrange", str(tmp_path / what), "-o", str(tmp_path / "out")]) == 2
         assert words_of_it in capfd.readouterr().err
+    bop = tmp_path / "bop"
+    bop.mkdir()
+    save_mesh(make_object("carton", 2), bop / "obj_000001.ply")
+    for text in ("[1]", '{"1": [1]}', '{"1": {"symmetries_continuous": [{"axis": [0, 0, 1]}]}}'):
+        (bop / "models_info.json").write_text(text)
+        assert run(["capture", "arrange", str(bop), "-o", str(tmp_path / "out")]) == 2
+        assert "not as BOP has it" in capfd.readouterr().err
     # Millimetres taken for metres.
     assert run(["capture", "arrange", str(folder / "carton.ply"), "-o", str(tmp_path / "out")]) == 2
     assert "is its unit right" in capfd.readouterr().err
+
+
+def test_what_is_not_ours_is_not_replaced(folder, tmp_path, capfd, monkeypatch):
+    assert run(words(folder, "kept", "--quiet", "--scenes", "1", "--count", "1")) == 0
+    (folder / "kept" / "notes").mkdir()
+    (folder / "kept" / "notes" / "mine.txt").write_text("mine")
+    assert run(words(folder, "kept", "--quiet", "--again")) == 2
+    assert "has notes in it" in capfd.readouterr().err
+    assert (folder / "kept" / "notes" / "mine.txt").read_text() == "mine"
+    (tmp_path / "file").write_text("mine")
+    mesh = str(folder / "carton.ply")
+    assert run(["capture", "arrange", mesh, "--unit", "mm", "-o", str(tmp_path / "file")]) == 2
+    assert "in the way" in capfd.readouterr().err
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    assert run(["capture", "arrange", mesh, "--unit", "mm", "-o", "."]) == 2
+    assert "a folder of its own" in capfd.readouterr().err and not list(tmp_path.glob("here/*"))

@@ -57,6 +57,20 @@ def test_refines_poses(table, capfd):
     assert "6 of 6 poses are sure" in said and "mm before" in said
 
 
+def test_raw_depth_alone_is_enough(table, capfd):
+    truth, folder, work = table
+    (folder / "depth").rename(folder / "raw")
+    camera = json.loads((folder / "camera.json").read_text())
+    (folder / "depth_camera.json").write_text(json.dumps({**camera, "colour_from_depth": np.eye(4).tolist()}))
+    assert run(["capture", "refine", str(folder), "-o", str(work), "--quiet"]) == 0
+    assert "6 of 6 poses are sure" in capfd.readouterr().out
+    error = off_by(read_trajectory(work / "refined.json").world_from_camera, truth)
+    assert np.linalg.norm(error[:, 3:], axis=1).max() < 0.003
+    (folder / "depth_camera.json").unlink()
+    assert run(["capture", "refine", str(folder), "-o", str(work), "--quiet"]) == 2
+    assert "depth_camera.json" in capfd.readouterr().err
+
+
 def test_refuses_in_words(table, capfd):
     _, folder, work = table
     assert run(["capture", "refine", str(folder), "-o", str(work / "elsewhere"), "--quiet"]) == 2

@@ -22,6 +22,7 @@ from ipjax.bop.dataset import VISIBLE
 from ipjax.capture.labels.masks import FrameLabels
 from ipjax.capture.models.frames import PosedFrame
 from ipjax.capture.models.making import ObjectModel
+from ipjax.capture.records import CaptureError
 from ipjax.files.meshes.mesh import diameter, move
 from ipjax.files.meshes.saving import save_mesh
 from ipjax.files.storage.folders import writing_folder
@@ -29,6 +30,8 @@ from ipjax.files.storage.parsing import read_json
 from ipjax.files.storage.writing import write_text, writing
 
 DEPTH_SCALE = 0.1  # millimetres per number of the depth images: up to 6.5 m; what is farther is left out
+# What `write_dataset` makes; anything else in the folder is somebody's.
+_MADE = {"camera.json", "dataset_info.json", "models", "models_eval", "test", "test_targets_bop19.json"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,3 +215,28 @@ def read_made_of(root: str | Path) -> str | None:
         return str(document["made_of"])
     except (ValueError, KeyError, TypeError):
         return None
+
+
+def check_dataset(dataset: Path) -> None:
+    """Refuse to replace a folder that is no data set of ours, or holds anything else.
+
+    Raises:
+      CaptureError: it is there, and somebody's; or it has no name of its own.
+    """
+    if dataset.name in ("", ".."):  # the folder where one stands cannot be written beside it and put in its place
+        raise CaptureError(f"{dataset}: the data set needs a folder of its own; give its name")
+    if not dataset.exists():
+        return
+    if not dataset.is_dir():
+        raise CaptureError(f"{dataset}: a file of this name is in the way")
+    there = sorted(path.name for path in dataset.iterdir() if path.name[0] != ".")
+    if there and read_made_of(dataset) is None:
+        raise CaptureError(
+            f"{dataset}: it is there, and no data set of ipjax capture; it is not replaced: give another name"
+        )
+    others = [name for name in there if name not in _MADE]
+    if others:
+        raise CaptureError(
+            f"{dataset}: it would be replaced, but has {others[0]} in it, which ipjax capture did not make; move that "
+            "away, or give another name"
+        )

@@ -15,9 +15,9 @@ from ipjax.capture.poses.given import check_given, read_given
 from ipjax.capture.poses.scale import make_metric
 from ipjax.capture.poses.sightings import find_by_board
 from ipjax.capture.poses.tracks import clean, join, reproject, triangulate
-from ipjax.capture.records import Capture, CaptureError, CaptureFrame, Tracks, Trajectory
+from ipjax.capture.records import Capture, CaptureError, Tracks, Trajectory
+from ipjax.capture.splatting import with_depth
 from ipjax.files.wording import abbreviate
-from ipjax.inference.depth import register_depth
 from ipjax.transforms import Similarity
 
 Method = Literal["auto", "given", "board", "structure", "depth"]
@@ -70,7 +70,7 @@ def find_poses(
     for index in range(len(capture)):
         read = capture.read_frame(index)
         depths.append(read.depth is not None)
-        features.append(detect(_with_depth(capture, read)))
+        features.append(detect(with_depth(capture, read)))
         say("features", index + 1, len(capture))
     matches, still = match(
         features, K, capture.size, still=find_gripper, progress=lambda done, total: say("matches", done, total)
@@ -139,15 +139,6 @@ def _begin_at_first(trajectory: Trajectory) -> Trajectory:
     rotation = np.where(known[:, None, None], moved.rotation, np.eye(3))
     translation = np.where(known[:, None], moved.translation, 0)
     return dataclasses.replace(trajectory, world_from_camera=Similarity(rotation, translation, poses.scale))
-
-
-def _with_depth(capture: Capture, frame: CaptureFrame) -> CaptureFrame:
-    """The frame; where only raw depth is there, that is splatted into the colours as the factory says."""
-    if frame.depth is not None or frame.raw_depth is None or capture.depth_camera is None:
-        return frame
-    factory = capture.colour_from_depth or Similarity(np.eye(3), np.zeros(3), np.ones(()))
-    depth = register_depth(frame.raw_depth, capture.depth_camera, factory, capture.camera, capture.size)
-    return dataclasses.replace(frame, depth=depth)
 
 
 def _tell_place(capture: Capture, registered: Sequence[bool]) -> list[str]:

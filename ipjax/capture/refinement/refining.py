@@ -20,6 +20,7 @@ from ipjax.capture.refinement.graph import Pairs
 from ipjax.capture.refinement.groups import all_pairs, choose_pairs, group_frames
 from ipjax.capture.refinement.solving import Equations, Problem, State, descend, evaluate
 from ipjax.capture.refinement.surfaces import Level, flatten_light, make_levels
+from ipjax.capture.splatting import with_depth
 from ipjax.records import Camera
 from ipjax.transforms import Similarity
 
@@ -85,13 +86,14 @@ def refine(
       progress: told a part in words, and how much of it is done.
 
     Raises:
-      CaptureError: fewer than two frames have poses, or none has depth registered to its colours.
+      CaptureError: fewer than two frames have poses, or one has neither depth registered to its colours nor raw depth
+        of a known camera.
     """
     say = progress or (lambda part, done, total: None)
     depths, colours = [], []
     wanted = settings or Settings()
     for index in np.flatnonzero(trajectory.registered):
-        frame = capture.read_frame(int(index))
+        frame = with_depth(capture, capture.read_frame(int(index)))
         if frame.depth is None:
             raise CaptureError(f"{capture.folder}: frame {frame.name} has no depth registered to its colours")
         depths.append(np.where(frame.usable, frame.depth, 0).astype(np.float32))

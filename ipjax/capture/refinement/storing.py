@@ -10,6 +10,7 @@ import numpy as np
 from ipjax.capture.records import Capture, CaptureError, Tracks, Trajectory
 from ipjax.capture.refinement.agreement import draw_agreement, list_neighbours, measure_agreement
 from ipjax.capture.refinement.refining import Refinement, Stages, describe, refine
+from ipjax.capture.splatting import with_depth
 from ipjax.capture.trajectories import write_trajectory
 from ipjax.files.storage.writing import write_text
 from ipjax.inference.drawing import write_image
@@ -51,7 +52,7 @@ def refine_in(
     found = refine(capture, before, tracks, stages=stages, progress=progress)
     depths: list[Any] = [None] * len(capture)
     for index in np.flatnonzero(before.registered):
-        frame = capture.read_frame(int(index))
+        frame = with_depth(capture, capture.read_frame(int(index)))
         assert frame.depth is not None  # or `refine` had refused it
         depths[index] = np.where(frame.usable, frame.depth, 0)
     neighbours = list_neighbours(before.registered)

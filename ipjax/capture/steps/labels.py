@@ -1,21 +1,17 @@
 """The step label: where is each object in each frame?"""
 
 import os
-from pathlib import Path
 
 import numpy as np
 
-from ipjax.capture.labels.dataset import read_made_of, write_dataset
+from ipjax.capture.labels.dataset import check_dataset, write_dataset
 from ipjax.capture.labels.masks import label_frames
 from ipjax.capture.labels.pictures import draw_labels
 from ipjax.capture.models.storing import read_models
-from ipjax.capture.records import CaptureError
 from ipjax.capture.steps.frames import open_frames
 from ipjax.capture.steps.records import Figure, Job, Outcome, Step
 from ipjax.inference.drawing import write_image
 
-# What `write_dataset` makes; anything else in the folder is somebody's.
-_MADE = {"camera.json", "dataset_info.json", "models", "models_eval", "test", "test_targets_bop19.json"}
 _SEEN = 0.1  # visible share below which BOP does not ask for an object
 
 
@@ -53,27 +49,6 @@ def label(job: Job) -> Outcome:
     objects = "1 object" if len(models) == 1 else f"{len(models)} objects"
     notes = (f"{len(frames)} frames with {objects}, in BOP's layout.",)
     return Outcome(("labels.png", relative), tuple(figures), notes, tuple(warnings))
-
-
-def check_dataset(dataset: Path) -> None:
-    """Refuse to replace a folder that is no data set of ours, or holds anything else.
-
-    Raises:
-      CaptureError: it is there, and somebody's.
-    """
-    if not dataset.exists():
-        return
-    if not dataset.is_dir():
-        raise CaptureError(f"{dataset}: a file of this name is in the way")
-    there = sorted(path.name for path in dataset.iterdir() if path.name[0] != ".")
-    if there and read_made_of(dataset) is None:
-        raise CaptureError(f"{dataset}: it is there, and no data set of ipjax capture; give another name")
-    others = [name for name in there if name not in _MADE]
-    if others:
-        raise CaptureError(
-            f"{dataset}: it would be replaced, but has {others[0]} in it, which ipjax capture did not make; move that "
-            "away, or give another name"
-        )
 
 
 STEP = Step(

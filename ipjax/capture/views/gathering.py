@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,8 +57,15 @@ def _read_folder(folder: Path) -> list[ObjectModel]:
     infos = folder / "models_info.json"
     if not infos.is_file():
         raise CaptureError(f"{folder}: it has neither {LIST}, of ipjax capture model, nor models_info.json, of BOP")
+    try:
+        return _read_bop(folder, read_json(infos))
+    except (AttributeError, KeyError, TypeError) as error:
+        raise CaptureError(f"{infos}: it is not as BOP has it ({error}): a dictionary of each object's") from None
+
+
+def _read_bop(folder: Path, infos: Any) -> list[ObjectModel]:
     found = []
-    for key, info in sorted(read_json(infos).items(), key=lambda item: int(item[0])):
+    for key, info in sorted(infos.items(), key=lambda item: int(item[0])):
         mesh = move(load_mesh(folder / f"obj_{int(key):06d}.ply"), np.eye(3), scale=0.001)
         discrete = [np.asarray(m, np.float64).reshape(4, 4).copy() for m in info.get("symmetries_discrete", ())]
         for matrix in discrete:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from ipjax.commands.capture.model import add_again
-from ipjax.commands.capture.views import check_replaceable
 from ipjax.commands.interface import options
 from ipjax.commands.interface.bars import Bars
 from ipjax.commands.interface.messages import Messages
@@ -47,18 +46,19 @@ def add(steps: Any) -> None:
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Arrange the models and write the data set; returns the exit status."""
-    from ipjax.capture.labels.dataset import LabelledScene, read_made_of, write_scenes
+    from ipjax.capture.labels.dataset import LabelledScene, check_dataset, read_made_of, write_scenes
     from ipjax.capture.labels.pictures import draw_labels
     from ipjax.capture.views.arranging import arrange
     from ipjax.capture.views.gathering import gather_models
     from ipjax.inference.drawing import write_image
     from ipjax.synthetic.sensor import PERFECT, STRUCTURED_LIGHT
 
-    root = Path(arguments.output)
+    root: Path = options.check_folder(arguments.output)
+    check_dataset(root)
     seed = options.check_seed(arguments.seed)
     models = gather_models(arguments.models, arguments.unit)
     made_of = _describe(arguments)
-    if not check_replaceable(root, made_of, read_made_of(root), arguments.again):
+    if read_made_of(root) == made_of and not arguments.again:
         messages.say(f"{root} was made of the same already; --again makes it once more.")
         messages.finish({"dataset": str(root), "made": False})
         return 0

@@ -39,28 +39,26 @@ def add(steps: Any) -> None:
 
 def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Label the frames and write the data set; returns the exit status."""
-    from ipjax.capture.labels.dataset import read_made_of, write_dataset
+    from ipjax.capture.labels.dataset import check_dataset, read_made_of, write_dataset
     from ipjax.capture.labels.masks import label_frames
     from ipjax.capture.labels.pictures import draw_labels
     from ipjax.capture.models.storing import LIST, read_models
-    from ipjax.capture.records import CaptureError
     from ipjax.inference.drawing import write_image
 
     work: Path = options.check_folder(arguments.output)
     root: Path = options.check_folder(arguments.dataset or work / "dataset")
+    check_dataset(root)
     models = list(read_models(work / "models"))
     frames = open_frames(arguments, work)
+    if arguments.weights is not None and not arguments.known:
+        raise ValueError("--weights are of the encoder of --known; without it nothing is encoded")
     known = [(str(path), path.stat().st_mtime_ns if path.is_file() else 0) for path in arguments.known or ()]
-    made_of = describe_inputs(arguments, work, {"models": (work / "models" / LIST).read_text(), "known": known})
-    before = read_made_of(root)
-    if before == made_of and not arguments.again:
+    told = {"models": (work / "models" / LIST).read_text(), "known": known, "weights": arguments.weights}
+    made_of = describe_inputs(arguments, work, told)
+    if read_made_of(root) == made_of and not arguments.again:
         messages.say(f"{root} was made of the same already; --again makes it once more.")
         messages.finish({"dataset": str(root), "made": False})
         return 0
-    if before is None and root.is_dir() and any(root.iterdir()):
-        raise CaptureError(
-            f"{root}: it is there, and no data set of ipjax capture; it is not replaced: give another name"
-        )
     notes: list[str] = []
     with Bars(quiet=arguments.quiet) as bars:
         if arguments.known:

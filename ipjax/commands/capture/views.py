@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     """Draw the views and write the data set; returns the exit status."""
     import numpy as np
 
-    from ipjax.capture.labels.dataset import LabelledScene, read_made_of, write_scenes
+    from ipjax.capture.labels.dataset import LabelledScene, check_dataset, read_made_of, write_scenes
     from ipjax.capture.labels.masks import label_frames, label_nothing
     from ipjax.capture.models.storing import LIST, read_models
     from ipjax.capture.views.choosing import find_middle
@@ -61,7 +61,8 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
     from ipjax.transforms import Similarity
 
     work: Path = options.check_folder(arguments.output)
-    root: Path = arguments.dataset or work / "views"
+    root: Path = options.check_folder(arguments.dataset or work / "views")
+    check_dataset(root)
     given = None
     if arguments.path not in ("orbit", "smooth"):
         given = read_path(arguments.path)
@@ -76,7 +77,7 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         "models": (work / "models" / LIST).read_text() if models else None,
     }
     made_of = describe_inputs(arguments, work, told, arguments.poses or find_poses(work))
-    if not check_replaceable(root, made_of, read_made_of(root), arguments.again):
+    if read_made_of(root) == made_of and not arguments.again:
         messages.say(f"{root} was made of the same already; --again makes it once more.")
         messages.finish({"dataset": str(root), "made": False})
         return 0
@@ -123,16 +124,3 @@ def run(arguments: argparse.Namespace, messages: Messages) -> int:
         }
     )
     return 0
-
-
-def check_replaceable(root: Path, made_of: str, before: str | None, again: bool) -> bool:
-    """Whether the data set is to be made; CaptureError where something else is in its place."""
-    from ipjax.capture.records import CaptureError
-
-    if before == made_of and not again:
-        return False
-    if before is None and root.is_dir() and any(root.iterdir()):
-        raise CaptureError(
-            f"{root}: it is there, and no data set of ipjax capture; it is not replaced: give another name"
-        )
-    return True
