@@ -62,6 +62,8 @@ def make_dataset(
     for place in (dataset, work):
         if capture.folder.resolve().is_relative_to(place.resolve()):
             raise CaptureError(f"{place}: the capture itself lies in it, and would be replaced; give another folder")
+    if work.resolve().is_relative_to(dataset.resolve()):
+        raise CaptureError(f"{work}: it lies in the data set, which is replaced as a whole; give another folder")
     job = Job(capture, work, dataset, settings)
     told, done = listener or Listener(), []
 

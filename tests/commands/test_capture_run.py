@@ -148,6 +148,7 @@ def test_refuses_in_one_line(folder, undisturbed, tmp_path, capfd):
     assert "no such folder" in refused(tmp_path / "nothing", "-o", tmp_path / "out")
     assert "describes no board" in refused(folder, "-o", tmp_path / "out", "--board", "chess:7x5")
     assert "--voxel is in millimetres" in refused(folder, "-o", tmp_path / "out", "--voxel", "0.002")
+    assert "lies in the data set" in refused(folder, "-o", tmp_path / "out", "--work", tmp_path / "out" / "work")
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "thesis.tex").write_text("x")
