@@ -101,6 +101,15 @@ PAGES = (
     Page("hand_eye", "benchmarks.hand_eye --page {results}/hand_eye.md"),
     Page("grasp_planning", "benchmarks.grasp_planning -o {results}/grasp_planning.md"),
     Page("labelling_costs", "benchmarks.labelling_costs --page {results}/labelling_costs.md"),
+    Page(
+        "labelling",
+        """
+        benchmarks.labelling throughput --frames 8 {weights} --output {out}/labelling
+        benchmarks.labelling run --frames 2000 {weights} --output {out}/labelling
+        benchmarks.labelling soak --frames 120 {weights} --output {out}/labelling
+        benchmarks.labelling page --output {out}/labelling --page {results}/labelling.md
+        """,
+    ),
     Page("compiling", "benchmarks.compiling --page {results}/compiling.md"),
     Page("bias", "benchmarks.bias --scenes 200 --frames 24 --page {results}/bias.md"),
     Page(

@@ -233,6 +233,7 @@ def _merge(
     from ipjax.files.objects.loading import load
     from ipjax.files.weights.hashes import hash_file
     from ipjax.labelling.merging.merge import merge
+    from ipjax.labelling.shards.ledger import in_words
     from ipjax.labelling.shards.plan import check_source, read_manifest
 
     manifest = read_manifest(arguments.output)
@@ -243,15 +244,11 @@ def _merge(
     objects = {number: load(path) for number, path in zip(numbers, paths, strict=True)}
     messages.print_notes()
     with Bars(quiet=arguments.quiet) as bars:
-        told = merge(
-            arguments.output,
-            objects,
-            source,
-            keys,
-            images=arguments.images,
-            split=arguments.split,
-            progress=bars.show,
-        )
+        about = {"images": arguments.images, "split": arguments.split, "progress": bars.show}
+        try:
+            told = merge(arguments.output, objects, source, keys, **about)
+        except OSError as error:
+            raise in_words(error, arguments.output) from error
     messages.say(
         f"{told.folder}: {told.frames} frames, {told.labels} labels, {told.bad} bad frames, {told.jumps} poses that "
         f"jump, {told.collisions} pairs of objects in one place; see {told.folder / 'quality.html'}"
