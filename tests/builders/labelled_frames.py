@@ -12,7 +12,7 @@ import numpy as np
 from builders.tiny_pipeline import TINY, two_objects
 from PIL import Image
 
-from ipjax.config import Config, RefineConfig, ScoreConfig
+from ipjax.config import Config, ScoreConfig
 from ipjax.files.images.run_lengths import decode_rle, encode_rle
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.objects.saving import save
@@ -21,11 +21,11 @@ from ipjax.labelling.batch import Labeller
 from ipjax.labelling.records import Batch, LabelSettings
 from ipjax.synthetic import problems
 
-# Poses from pairs alone, neither refined nor drawn: a third of the graph to be compiled.
+# Poses from pairs, refined once and neither scored nor drawn: a third of the graph to be compiled.
 CONFIG = Config(
     match=TINY.match,
     align=TINY.align,
-    refine=RefineConfig(steps=0, settle=False),
+    refine=TINY.refine,
     score=ScoreConfig(resolution=28, ranking="inliers", alternates=0, drawn=0),
 )
 HEIGHT, WIDTH = 96, 128
