@@ -105,7 +105,7 @@ def make_inputs(options: argparse.Namespace) -> None:
         objects.mkdir(exist_ok=True)
         encoder = load_encoder(options.weights)
         for path, mesh, size in zip(paths, meshes, SIZES, strict=True):
-            onboard(mesh, encoder, OnboardConfig(), out=path, name=path.stem, metres_per_unit=size)
+            onboard(mesh, encoder, OnboardConfig(), out=path, name=path.stem, metres_per_unit=size * mesh.scale)
     scenes.mkdir(exist_ok=True)
     wanted = min(options.frames, SCENES)
     for seed in bar(range(wanted), desc="scenes"):

@@ -59,7 +59,7 @@ def led(count: int, speed: float = 0.03):
 
 def test_a_camera_that_moves_makes_no_jumps_however_fast():
     for speed in (0.0, 0.03, 0.3):
-        assert find_jumps(make_poses(*led(20, speed)), SURFACES) == []
+        assert find_jumps(make_poses(*led(20, speed)), SURFACES) == ([], [])
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -67,7 +67,8 @@ def test_a_pose_that_is_off_its_neighbours_jumps(number):
     turns, places = led(20)
     places[7] += [0.1, 0, 0]
     turns[12] += [2.0, 0, 0]
-    jumps = find_jumps(make_poses(turns, places, number=number), SURFACES)
+    jumps, unrelated = find_jumps(make_poses(turns, places, number=number), SURFACES)
+    assert unrelated == []
     # A ball that is turned looks as before.
     assert [one.row for one in jumps] == ([7, 12] if number == 1 else [7])
     assert jumps[0].moved == pytest.approx(0.5, abs=1e-6)
@@ -80,12 +81,22 @@ def test_only_neighbours_of_one_object_in_one_scene_are_compared():
     places[7] += [0.1, 0, 0]
     whole = make_poses(turns, places)
     apart = dataclasses.replace(whole, scene=np.arange(20) // 8, image=whole.image)  # frame 7 is the last of its scene
-    assert find_jumps(apart, SURFACES) == []
+    assert find_jumps(apart, SURFACES) == ([], [])
     unsure = dataclasses.replace(whole, present=whole.place != 7)
-    assert find_jumps(unsure, SURFACES) == []
+    assert find_jumps(unsure, SURFACES) == ([], [])
     rare = dataclasses.replace(whole, image=10 * whole.image)
-    assert find_jumps(rare, SURFACES) == []
-    assert find_jumps(make_poses(*led(2)), SURFACES) == []
+    assert find_jumps(rare, SURFACES) == ([], [])
+    assert find_jumps(make_poses(*led(2)), SURFACES) == ([], [])
+
+
+def test_frames_that_do_not_follow_one_another_are_not_judged():
+    """Single photos of one scene beside a sequence of another, in which one pose jumps."""
+    rng = np.random.default_rng(0)
+    photos = make_poses(rng.normal(size=(20, 3)), rng.uniform((-0.3, -0.3, 0.4), (0.3, 0.3, 1), (20, 3)), scene=4)
+    turns, places = led(20)
+    places[7] += [0.1, 0, 0]
+    jumps, unrelated = find_jumps(join(photos, make_poses(turns, places, scene=5)), SURFACES)
+    assert unrelated == [4] and [one.row for one in jumps] == [27]
 
 
 def test_two_objects_in_one_place_collide_and_those_that_touch_do_not():
@@ -108,7 +119,7 @@ def test_the_frames_to_look_at_are_the_telling_ones():
     margin[[10, 11, 50]] = 0.02, 0.01, 0.1
     confidence[40] = 0.55
     poses = dataclasses.replace(poses, margin=margin, confidence=confidence)
-    jumps = find_jumps(poses, SURFACES)
+    jumps, _ = find_jumps(poses, SURFACES)
     chosen = choose_frames(poses, jumps, [], 12)
     reasons = {one.place: one.reason for one in chosen}
     assert len(reasons) == len(chosen) == 12

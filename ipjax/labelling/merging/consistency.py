@@ -17,6 +17,7 @@ GAP = 3  # images between neighbours, at most
 MOVED = 0.3  # diameters by which a pose must be off
 TURNED = 0.6  # rad: the same
 DETOUR = 1.0  # how many times as far it must be off as its neighbours are from each other
+UNRELATED = 0.3  # share of a scene's poses that jump, beyond which its frames do not follow one another
 SHAPE = 0.06  # diameters: turns that move the surface by less, as of a round object, are none
 INSIDE = 0.2, 0.6  # shares of two objects that lie in the other's box, the smaller and the larger: a fruit in a bowl
 # is in its box, but the bowl is not in the fruit's
@@ -40,17 +41,20 @@ class Collision:
     share: float  # of each, at least, that lies in the other's box
 
 
-def find_jumps(poses: Poses, surfaces: Mapping[int, Float[np.ndarray, "p 3"]]) -> list[Jump]:
+def find_jumps(poses: Poses, surfaces: Mapping[int, Float[np.ndarray, "p 3"]]) -> tuple[list[Jump], list[int]]:
     """Poses that are off what those before and after say, of their object in the same scene; only present ones count.
 
     Args:
         surfaces: points of each object, by its number; diameter 1.
+
+    Returns:
+        The jumps, and the scenes whose frames do not follow one another, of which nothing can be said: single photos.
     """
     found = []
     rows = np.flatnonzero(poses.present)
     order = rows[np.lexsort((poses.image[rows], poses.slot[rows], poses.number[rows], poses.scene[rows]))]
     if len(order) < 3:
-        return []
+        return [], []
     before, at, after = order[:-2], order[1:-1], order[2:]
     same = np.ones(len(at), bool)
     for name in ("scene", "number", "slot"):
@@ -74,7 +78,11 @@ def find_jumps(poses: Poses, surfaces: Mapping[int, Float[np.ndarray, "p 3"]]) -
         ):
             continue
         found.append(Jump(row, float(moved[place]), float(turned[place])))
-    return sorted(found, key=lambda one: one.row)
+    scenes, counts = np.unique(poses.scene[at], return_counts=True)
+    jumping = [int((poses.scene[[one.row for one in found]] == scene).sum()) if found else 0 for scene in scenes]
+    unrelated = [int(s) for s, all_of, some in zip(scenes, counts, jumping, strict=True) if some > UNRELATED * all_of]
+    kept = [one for one in found if int(poses.scene[one.row]) not in unrelated]
+    return sorted(kept, key=lambda one: one.row), unrelated
 
 
 def find_collisions(poses: Poses, surfaces: Mapping[int, Float[np.ndarray, "p 3"]]) -> list[Collision]:

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -108,16 +110,18 @@ def merge(
         mesh_from_object = {number: info.object_from_mesh.to_numpy().inverse() for number, info in infos.items()}
         poses = gather_poses(every(), mesh_from_object)
         surfaces = {number: _surface(templates) for number, (templates, _) in objects.items()}
-        jumps, collisions = find_jumps(poses, surfaces), find_collisions(poses, surfaces)
+        (jumps, unrelated), collisions = find_jumps(poses, surfaces), find_collisions(poses, surfaces)
         chosen = choose_frames(poses, jumps, collisions, pictures)
         wanted = {int(poses.place[row]) for one in jumps for row in (one.row,)}
         wanted |= {int(poses.place[one.first]) for one in collisions} | {one.place for one in chosen}
         kept = {place: entry for place, entry in every() if place in wanted}
         frame_name = lambda place: kept[place]["name"]
-        write_text(merged / "quality.json", _quality(poses, jumps, collisions, frame_name))
+        doubts = _count_notes(entry for _, entry in every())
+        write_text(merged / "quality.json", _quality(poses, jumps, collisions, unrelated, doubts, frame_name))
         reasons = [(one["frame"], one["reason"]) for one in bad]
         about = folder.resolve().name, manifest["frames"], poses, infos, jumps, collisions, reasons
-        write_page(merged / "quality.html", *about, [(one, kept[one.place]) for one in chosen], read, frame_name)
+        sample = [(one, kept[one.place]) for one in chosen]
+        write_page(merged / "quality.html", *about, sample, read, frame_name, unrelated=unrelated, doubts=doubts)
     labels = int(poses.present.sum())
     return Merged(folder / MERGED, manifest["frames"], labels, len(bad), len(jumps), len(collisions))
 
@@ -241,7 +245,27 @@ def _surface(templates: Templates) -> np.ndarray:
     return points[np.linspace(0, len(points) - 1, min(_SURFACE, len(points))).astype(int)]
 
 
-def _quality(poses: Poses, jumps: Sequence[Jump], collisions: Sequence[Collision], name: Callable[[int], str]) -> str:
+def _count_notes(entries: Iterable[Entry]) -> list[tuple[str, int]]:
+    """What was said of instances, the most frequent first; sentences that differ in numbers alone are one."""
+    counts: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    for entry in entries:
+        for one in entry["instances"]:
+            if one["note"]:
+                kind = re.sub(r"\d[\d.]*", "#", one["note"])
+                first.setdefault(kind, one["note"])
+                counts[kind] += 1
+    return [(first[kind], count) for kind, count in counts.most_common()]
+
+
+def _quality(
+    poses: Poses,
+    jumps: Sequence[Jump],
+    collisions: Sequence[Collision],
+    unrelated: Sequence[int],
+    doubts: Sequence[tuple[str, int]],
+    name: Callable[[int], str],
+) -> str:
     """What the page tells, all of it, for programs."""
     what = lambda row: {"frame": name(int(poses.place[row])), "number": int(poses.number[row])}
     found = {
@@ -251,5 +275,7 @@ def _quality(poses: Poses, jumps: Sequence[Jump], collisions: Sequence[Collision
         "collisions": [
             what(one.first) | {"other": int(poses.number[one.second]), "share": one.share} for one in collisions
         ],
+        "scenes_without_sequence": list(unrelated),
+        "notes": [{"first": said, "count": count} for said, count in doubts],
     }
     return json.dumps(found, indent=1) + "\n"

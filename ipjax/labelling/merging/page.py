@@ -9,6 +9,7 @@ import numpy as np
 from ipjax.files.objects.record import ObjectInfo
 from ipjax.files.pages import embed_image, render_page
 from ipjax.files.storage.writing import write_text
+from ipjax.files.wording import abbreviate
 from ipjax.labelling.entries import Entry
 from ipjax.labelling.merging.consistency import Collision, Jump
 from ipjax.labelling.merging.poses import Poses
@@ -19,6 +20,7 @@ from ipjax.labelling.sources.records import SourceFrame
 _TEMPLATE = Path(__file__).with_name("page.html.jinja")
 _BINS = 20
 _LISTED = 40  # jumps, collisions and bad frames, each; quality.json and bad_frames.json have all
+_DOUBTS = 8  # kinds of them
 _HEIGHT = 420  # of a picture, pixels
 
 
@@ -34,6 +36,9 @@ def write_page(
     sample: Sequence[tuple[Choice, Entry]],
     read: Callable[[int], SourceFrame] | None,
     names: Callable[[int], str],
+    *,
+    unrelated: Sequence[int] = (),
+    doubts: Sequence[tuple[str, int]] = (),
 ) -> None:
     """Write the page of a merged data set.
 
@@ -44,6 +49,8 @@ def write_page(
         sample: frames to look at, with their entries.
         read: a frame by its place; None = the source is not there, and the page has no pictures.
         names: of a frame by its place.
+        unrelated: scenes whose frames do not follow one another.
+        doubts: what was said of instances, and how often.
 
     Raises:
         OSError: it cannot be written.
@@ -62,6 +69,8 @@ def write_page(
         "collisions": [_tell_collision(poses, one, infos, names) for one in collisions[:_LISTED]],
         "bad": [{"frame": name, "reason": reason} for name, reason in bad[:_LISTED]],
         "listed": _LISTED,
+        "unrelated": abbreviate(unrelated),
+        "doubts": [{"text": text, "count": f"{count:,}"} for text, count in doubts[:_DOUBTS]],
         "sample": [_show(choice, entry, infos, read, poses) for choice, entry in sample],
         "has_pictures": read is not None,
     }
